@@ -1,7 +1,7 @@
-"""What a wheel holds: hoidata and, inside it as hoidata/installed, all that stands beside it here.
+"""What a wheel holds: hoidata and, inside it as hoidata/installed, the packages next to it here.
 
 So an installation takes one name of Python's, not three: a user's own ``models`` and ``pipelines`` stay theirs.
-``hoidata/beside.py`` finds these packages in a clone and in an installation.
+``hoidata/package_paths.py`` finds these packages in a clone and in an installation.
 """
 
 from setuptools import find_packages, setup
@@ -13,11 +13,11 @@ PROJECT = ["params.yaml", "prefect.toml", ".dvcignore", ".gitignore"]
 FOLDERS = [".dvc/config", ".dvc/.gitignore", "manifests/embedded/*.json", "manifests/study/*.json", *GRAPHS]
 
 own = find_packages(include=["hoidata*"])
-beside = [f"{INSTALLED}.{name}" for name in find_packages(include=["models*", "pipelines*"])]
+inside = [f"{INSTALLED}.{name}" for name in find_packages(include=["models*", "pipelines*"])]
 data = [*(f"**/*.{suffix}" for suffix in DATA), "vendor/LICENSE-three"]
 setup(
-    packages=[*own, INSTALLED, *beside],
+    packages=[*own, INSTALLED, *inside],
     package_dir={INSTALLED: "."},
-    package_data={**dict.fromkeys([*own, *beside], data), INSTALLED: [*PROJECT, *FOLDERS]},
+    package_data={**dict.fromkeys([*own, *inside], data), INSTALLED: [*PROJECT, *FOLDERS]},
     exclude_package_data={INSTALLED: ["setup.py", "pyproject.toml"]},
 )

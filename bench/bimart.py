@@ -55,21 +55,21 @@ def main() -> None:
     angles = np.pi / 2 * np.sin(np.linspace(0, np.pi, FRAMES))
     posed_m = articulate(model.vertices_m, model.part, model.hinge, angles)
     cached_bps = PartBps(model, settings)
-    nearest = cached_bps.look(angles)
+    nearest = cached_bps.nearest_points(angles)
     rng = np.random.default_rng(1)
     drift = np.cumsum(rng.normal(0, 0.002, (2, FRAMES, 1, 3)), axis=1)
     hands = rng.normal(0, 0.05, (2, 1, HAND, 3)) + drift + np.array([0.0, 0.05, 0.1])
     differing = np.mean(reference_bps(model, settings, cached_bps.scale, posed_m) != nearest.vertex)
-    maps = np.stack([distance_map(nearest.place_m, hand) for hand in hands])
-    largest_error_m = np.abs(maps - reference_maps(nearest.place_m.astype(np.float64), hands)).max()
+    maps = np.stack([distance_map(nearest.point_m, hand) for hand in hands])
+    largest_error_m = np.abs(maps - reference_maps(nearest.point_m.astype(np.float64), hands)).max()
     times = medians(
         {
             "trees": lambda: reference_bps(model, settings, cached_bps.scale, posed_m),
-            "first": lambda: PartBps(model, settings).look(angles),
-            "again": lambda: cached_bps.look(angles),
+            "first": lambda: PartBps(model, settings).nearest_points(angles),
+            "again": lambda: cached_bps.nearest_points(angles),
             "maps, trees, every vertex": lambda: reference_maps(posed_m, hands),
-            "maps, trees, picked vertices": lambda: reference_maps(nearest.place_m, hands),
-            "maps": lambda: [distance_map(nearest.place_m, hand) for hand in hands],
+            "maps, trees, picked vertices": lambda: reference_maps(nearest.point_m, hands),
+            "maps": lambda: [distance_map(nearest.point_m, hand) for hand in hands],
         },
         runs=5,
     )

@@ -1,1 +1,1 @@
-"""Data of 3D hand-object interaction: raw datasets to one schema, with words, contact, splits and measures."""
+"""Data of 3D hand-object interaction: raw datasets in one schema, with sentences, contact, splits and metrics."""

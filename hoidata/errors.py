@@ -1,4 +1,4 @@
-"""Errors that name the place, what was expected, what came, and what to do."""
+"""Errors with four parts: source, what was expected, what was found, and the remedy."""
 
 import errno
 import re
@@ -6,18 +6,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NOT_ALLOWED = {errno.EROFS, errno.EACCES, errno.EPERM}
 
 
 class HoidataError(Exception):
-    """Base of every error hoidata raises on purpose; its text is meant for the user."""
+    """Base class of the errors for users; the text needs no traceback."""
 
 
 class BadInput(HoidataError):
-    """A file or value that cannot be used. Conversion turns it into one quarantined sequence.
+    """A file or value that cannot be used; conversion quarantines the sequence it belongs to.
 
-    The message always has four parts: where, what was expected, what came, what to do.
+    Args:
+        where: the file, key or argument.
+        expected: what would be valid.
+        got: what was found.
+        remedy: what the user can do.
     """
 
     def __init__(self, where: str | Path, expected: str, got: str, remedy: str = "download it again") -> None:
@@ -32,44 +36,44 @@ class BadInput(HoidataError):
 
 
 class ChangedMeanwhile(BadInput):
-    """A raw file is not, or no longer, as it was listed: the data moved under a run; no sequence is to blame."""
+    """A raw file differs from the manifest because the raw folder changed during a run."""
 
 
 class MachineTrouble(HoidataError):
-    """The machine failed, not what it was given: no room on the disk, nothing may be written, a disk that fails."""
+    """The machine failed, not the input: disk full or read-only, I/O error, too little memory."""
 
 
 @contextmanager
 def told_in_words() -> Iterator[None]:
-    """What the system says of a full or read-only disk, or of too little memory, raised as MachineTrouble."""
+    """Raise MachineTrouble with a remedy for a full or read-only disk, an I/O error, or too little memory."""
     try:
         yield
     except HoidataError:
         raise
     except Exception as error:
-        if isinstance(error, BrokenPipeError) or not (words := _trouble(error)):
+        if isinstance(error, BrokenPipeError) or not (message := _machine_message(error)):
             raise
-        raise MachineTrouble(words) from error
+        raise MachineTrouble(message) from error
 
 
-def _trouble(error: Exception) -> str:
-    """The trouble and what to do, in words; empty where the error is more likely a defect."""
+def _machine_message(error: Exception) -> str:
+    """Message with a remedy; empty for an error that is more likely a defect of the program."""
     if isinstance(error, MemoryError):
         return f"not enough memory ({error}); end other programs or lower --jobs, and run again"
-    told = re.search(r"\(os error (\d+)\)", str(error))  # so libraries in Rust tell it (safetensors)
+    rust_error = re.search(r"\(os error (\d+)\)", str(error))  # as libraries in Rust (safetensors) write it
     if type(error).__name__ == "OperationalError" and ("disk" in str(error) or "readonly" in str(error)):
-        return f"DVC's database: {error}: no room, or it cannot be written; mend that and run again"
-    if not isinstance(error, OSError) and not told:
+        return f"DVC's database: {error}: no room, or it cannot be written; repair that and run again"
+    if not isinstance(error, OSError) and not rust_error:
         return ""
-    number = int(told[1]) if told else getattr(error, "errno", None)
-    kept = "what was there before is as it was. Run again: finished work is taken up"
-    # NumPy and Arrow tell of a write that came short without a number.
-    if number in _NO_ROOM or (number is None and "written" in str(error)) or "No space left" in str(error):
-        return f"{error}: no room; make some, {kept}"
+    number = int(rust_error[1]) if rust_error else getattr(error, "errno", None)
+    unchanged = "existing files are unchanged. Run again: finished work is resumed"
+    # NumPy and Arrow report a short write without an error number.
+    if number in _NO_SPACE or (number is None and "written" in str(error)) or "No space left" in str(error):
+        return f"{error}: no space; make some room, {unchanged}"
     if number in _NOT_ALLOWED:
-        return f"{error}: allow writing there; {kept}"
-    return f"{error}: the disk fails; {kept}" if number == errno.EIO else ""
+        return f"{error}: allow writing there; {unchanged}"
+    return f"{error}: the disk fails; {unchanged}" if number == errno.EIO else ""
 
 
 class MissingResource(HoidataError):
-    """Something the user has to provide (a licensed file, a path, an extra package) is not there."""
+    """Something the user has to provide is missing: a licensed file, a path, an extra package."""

@@ -1,6 +1,6 @@
-"""When a process of ours ends: with the process that started it, and within seconds of Ctrl-C or SIGTERM.
+"""Lifetime of processes: they end with the process that started them, and within seconds of Ctrl-C or SIGTERM.
 
-Ending at any moment is safe, because what we write appears whole or not at all.
+Ending at any moment is safe, because files are written atomically.
 """
 
 import _thread
@@ -19,16 +19,18 @@ from typing import NoReturn
 
 PR_SET_PDEATHSIG = 1  # of linux/prctl.h
 GRACE_S = 8.0
-LOOK_S = 0.2
-INTERRUPTED = "interrupted: nothing that was there is lost; run it again"
+POLL_S = 0.2
+INTERRUPTED = "interrupted: finished work is kept; run it again"
 _received: list[int] = []
 
 
 def end_with_parent(parent: int) -> None:
     """Make the kernel kill this process when its parent ends, however it ends. For programs started with ``exec``.
 
-    parent: process id of the parent. If it has ended already, this process ends now. The kernel also counts the end of
-    the thread that started this process. Only Linux can do this.
+    The end of the thread that started this process counts, too. Linux only.
+
+    Args:
+        parent: process id of the parent. If it has ended already, this process ends now.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -37,14 +39,14 @@ def end_with_parent(parent: int) -> None:
 
 
 def end_with_starter() -> None:
-    """Kill this process of ``multiprocessing`` when the process that started it ends, however it ends."""
+    """Kill this ``multiprocessing`` process when its parent ends, however it ends."""
     starter = multiprocessing.parent_process()
     assert starter is not None
     _end_after(starter.join)
 
 
 def begin_worker() -> None:
-    """The beginning of a worker process: it ends with its starter, which alone decides what Ctrl-C ends."""
+    """Initialise a worker process: it ends with its parent and ignores Ctrl-C, which the parent handles."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     end_with_starter()
@@ -52,10 +54,10 @@ def begin_worker() -> None:
 
 @contextmanager
 def ctrl_c_blocked() -> Iterator[None]:
-    """Processes of ``multiprocessing`` that start meanwhile see no Ctrl-C until they unblock it.
+    """Block Ctrl-C in ``multiprocessing`` processes that are started inside, until they unblock it.
 
-    In a terminal Ctrl-C reaches all processes of a command, and an interpreter that starts would print a traceback.
-    This process gets it after the block.
+    In a terminal Ctrl-C reaches all processes of a command, and a starting interpreter would print a traceback. This
+    process receives it at the end of the block.
     """
     resource_tracker.ensure_running()  # which unblocks Ctrl-C in this thread when it starts
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -66,20 +68,20 @@ def ctrl_c_blocked() -> Iterator[None]:
 
 
 def end_with_process(pid: int) -> None:
-    """Kill this process when any other process ends, however it ends."""
+    """Kill this process when the process ``pid`` ends, however it ends."""
     import psutil
 
     def wait() -> None:
         with suppress(psutil.NoSuchProcess):
             process = psutil.Process(pid)
             while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
-                time.sleep(LOOK_S)
+                time.sleep(POLL_S)
 
     _end_after(wait)
 
 
 def _end_after(wait: Callable[[], object]) -> None:
-    """Kill this process when ``wait`` returns; the leader of a process group takes its group along."""
+    """Kill this process when ``wait`` returns; the leader of a process group kills its group."""
 
     def end() -> None:
         wait()
@@ -92,8 +94,8 @@ def _end_after(wait: Callable[[], object]) -> None:
 def run_interruptibly(main: Callable[[], int | None]) -> NoReturn:
     """Run a command and exit with its code; after Ctrl-C with 130, after SIGTERM with 143, and never with a traceback.
 
-    A second signal ends the process at once. The processes it started must end with it. A signal that this process
-    was started to ignore, as ``command &`` in a script does with Ctrl-C, stays ignored.
+    A second signal ends the process immediately. The processes it started must end with it. A signal that the parent
+    made this process ignore stays ignored, as Ctrl-C for ``command &`` in a script.
     """
     end_on_signals()
     try:
@@ -104,13 +106,13 @@ def run_interruptibly(main: Callable[[], int | None]) -> NoReturn:
         print(INTERRUPTED, file=sys.stderr)
         sys.exit(128 + _received[0])
     finally:
-        for number in (signal.SIGINT, signal.SIGTERM):  # an exception in the interpreter's own end prints a traceback
+        for number in (signal.SIGINT, signal.SIGTERM):  # an exception during shutdown prints a traceback
             if signal.getsignal(number) == _interrupt:
                 signal.signal(number, signal.SIG_DFL)
 
 
 def end_on_signals() -> None:
-    """Let Ctrl-C and SIGTERM raise KeyboardInterrupt, and end this process after GRACE_S whatever it does then."""
+    """Let Ctrl-C and SIGTERM raise KeyboardInterrupt, and end this process after at most GRACE_S."""
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _interrupt)
@@ -118,14 +120,14 @@ def end_on_signals() -> None:
 
 
 def _on_unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Python prints and drops what is raised while it deletes an object: also the interrupt."""
+    """End after an interrupt in a destructor, whose exceptions Python prints and drops."""
     if _received and isinstance(unraisable.exc_value, KeyboardInterrupt):
         _end_now(_received[0])
     sys.__unraisablehook__(unraisable)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    # Modules of other projects catch BaseException while they are imported, and then go on.
+    # Some third-party modules catch BaseException while they are imported, and continue.
     if _received or _is_importing(frame):
         _end_now(number)
     _received.append(number)
@@ -148,6 +150,6 @@ def _end_later(number: int) -> None:
 
 
 def _end_now(number: int) -> NoReturn:
-    with suppress(OSError):  # nobody reads it
+    with suppress(OSError):  # no reader
         os.write(2, f"{INTERRUPTED}\n".encode())
     os._exit(128 + number)

@@ -1,4 +1,4 @@
-"""The folder with what belongs to this machine and is not in git: hoidata.toml, generated raw files, new manifests."""
+"""The folder of untracked files of this machine: hoidata.toml, generated raw files, new manifests."""
 
 import os
 from pathlib import Path
@@ -7,10 +7,10 @@ SETTINGS = "hoidata.toml"
 
 
 def machine_folder() -> Path:
-    """The current folder, a project, except in an experiment that DVC runs in a temporary copy.
+    """The project folder: the current folder, or the original project of a DVC experiment.
 
-    ``dvc exp run --temp`` and ``--queue`` copy what git knows to a folder below ``.dvc/tmp``. There it is the project
-    the copy was made from, which DVC names in DVC_ROOT.
+    ``dvc exp run --temp`` and ``--queue`` run in a copy of the tracked files below ``.dvc/tmp``. DVC_ROOT is then the
+    original project.
     """
     root = os.environ.get("DVC_ROOT")
     return Path(root) if root and Path.cwd().is_relative_to(Path(root).resolve() / ".dvc/tmp") else Path()

@@ -1,8 +1,8 @@
-"""What Prefect loads at its start in a project's folder: the hook of ``pipelines.prefect_hook``."""
+"""Plugin that Prefect loads when it starts in a project folder: the hook of ``pipelines.prefect_hook``."""
 
 from importlib import import_module
 
-from hoidata.beside import add_to_path
+from hoidata.package_paths import add_to_path
 
 add_to_path()
 setup_environment = import_module("pipelines.prefect_hook").setup_environment

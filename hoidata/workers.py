@@ -1,11 +1,11 @@
-"""One function over many items in worker processes, or on Dask.
+"""Apply one function to many items in worker processes, or on Dask.
 
-Unlike ``concurrent.futures`` and loky, whose pools break as a whole, it knows which item each worker had when it died
-and of what; only that item is done again. Its workers end with their parent.
+The pools of ``concurrent.futures`` and loky break as a whole when a worker dies. This one repeats only the item of the
+dead worker, and reports the cause. Workers end with their parent.
 
-Dask is an optional extra (``pip install 'hoidata[dask]'``): a cluster of this machine, or one that runs already. It is
-chosen for a process, not for a call: results never depend on it. Its workers need the same environment and the same
-files at the same paths.
+Dask is an optional extra (``pip install 'hoidata[dask]'``): a local cluster, or a running one. It is chosen per
+process, not per call, since results do not depend on it. Its workers need the same environment and the same files at
+the same paths.
 """
 
 import contextlib
@@ -33,13 +33,13 @@ _chosen = [LOCAL]
 
 
 class WorkerLost(BadInput):
-    """An item whose worker process died, also when it was tried once more alone. cause: of what, in words."""
+    """An item whose worker process died twice, the second time without other workers. cause: why the process ended."""
 
     def __init__(self, item: Any, cause: str) -> None:
         self.item, self.cause = item, cause
-        got = f"a process that died ({cause}), and so did another one that had nothing else to do"
-        remedy = "run it again with more free memory, or look whether its files are damaged"
-        super().__init__(str(item), "a worker process that lives until it is done", got, remedy)
+        got = f"a process that died ({cause}), twice"
+        remedy = "run it again with more free memory, or check whether its files are damaged"
+        super().__init__(str(item), "a worker process that finishes it", got, remedy)
 
     def __reduce__(self) -> tuple:
         return type(self), (self.item, self.cause)
@@ -47,9 +47,9 @@ class WorkerLost(BadInput):
 
 @dataclass
 class _Died:
-    """In the place of a result. cause: what ended the process, in words."""
+    """Result of an item whose worker process died."""
 
-    cause: str
+    cause: str  # why the process ended
 
 
 @dataclass
@@ -65,12 +65,17 @@ Function = Callable[[Any], Any]
 def in_workers(
     function: Function, items: Sequence[Any], jobs: int, lock: int = -1, on_lost: Function | None = None
 ) -> Iterator[tuple[Any, Any]]:
-    """Each item with the function's result for it, in no fixed order; one item per worker at a time.
+    """Yield each item with the function's result, in no fixed order; exceptions of the function are raised.
 
-    jobs: fresh processes, each with one thread; 1 does the work here, where a death ends all. lock: a file descriptor
-    each worker keeps open as long as it lives. on_lost: gives the result of an item whose worker died twice, from a
-    WorkerLost; without it that is raised, after all others are done. Raises what the function raised. On a cluster
-    (``choose_workers``) chunks of items are given out instead.
+    A worker has one item at a time; on a cluster (``choose_workers``) a chunk of items.
+
+    Args:
+        function: applied to each item.
+        items: the items.
+        jobs: number of new processes, each with one thread; 1 works in this process.
+        lock: a file descriptor that each worker keeps open until it ends; -1 for none.
+        on_lost: result of an item whose worker died twice, from its WorkerLost. By default the WorkerLost is raised
+            after all other items.
     """
     if is_used_for(jobs) and len(items) > 1:
         yield from _on_cluster(function, items, jobs, on_lost)
@@ -80,25 +85,25 @@ def in_workers(
             yield from ((item, function(item)) for item in items)
         return
     lost = []
-    for item, result in _shared_out(function, items, jobs, lock):
+    for item, result in _distributed(function, items, jobs, lock):
         if isinstance(result, _Died):
             lost.append(item)
         else:
             yield item, result
-    for item in lost:  # alone: it may need all the memory there is
-        for _, result in _shared_out(function, [item], 1, lock):
+    for item in lost:  # without other workers: it may need all memory
+        for _, result in _distributed(function, [item], 1, lock):
             died = isinstance(result, _Died)
-            yield item, _given_up(on_lost, WorkerLost(item, result.cause)) if died else result
+            yield item, _result_of_lost(on_lost, WorkerLost(item, result.cause)) if died else result
 
 
-def _given_up(on_lost: Function | None, error: WorkerLost) -> Any:
+def _result_of_lost(on_lost: Function | None, error: WorkerLost) -> Any:
     if on_lost is None:
         raise error
     return on_lost(error)
 
 
 def in_order(pairs: Iterator[tuple[Any, Any]], items: Sequence[Any]) -> Iterator[tuple[Any, Any]]:
-    """The pairs of ``in_workers`` in the order of the items; those that come early are held until their turn."""
+    """Sort the pairs of ``in_workers`` into the order of the items; early results are buffered."""
     early: dict[Any, Any] = {}
     for item in items:
         while item not in early:
@@ -107,8 +112,8 @@ def in_order(pairs: Iterator[tuple[Any, Any]], items: Sequence[Any]) -> Iterator
         yield item, early.pop(item)
 
 
-def _shared_out(function: Function, items: Sequence[Any], jobs: int, lock: int) -> Iterator[tuple[Any, Any]]:
-    """Each item with its result, or with ``_Died``; the dead worker's place is taken by a fresh one."""
+def _distributed(function: Function, items: Sequence[Any], jobs: int, lock: int) -> Iterator[tuple[Any, Any]]:
+    """Yield each item with its result or ``_Died``; a dead worker is replaced by a new one."""
     waiting = iter(items)
     workers = [_start(function, lock) for _ in range(min(jobs, len(items)))]
     try:
@@ -126,7 +131,7 @@ def _shared_out(function: Function, items: Sequence[Any], jobs: int, lock: int) 
                 if _give(worker, waiting):
                     busy.append(worker)
     finally:
-        # Nothing is lost by killing: what a worker writes appears whole or not at all.
+        # Killing is safe: workers write files atomically.
         for worker in workers:
             worker.process.kill()
         for worker in workers:
@@ -136,9 +141,9 @@ def _shared_out(function: Function, items: Sequence[Any], jobs: int, lock: int) 
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """One thread of torch and of BLAS, as in a worker: their number can change the last bit of a fit, and time.
+    """Limit torch and BLAS to one thread, as in a worker: the number of threads can change the last bit of a fit.
 
-    Several threads of BLAS take five times as long as one on matrices as small as a hand's.
+    Several BLAS threads take five times as long as one on matrices of the size of a hand.
     """
     import torch
     from threadpoolctl import threadpool_limits
@@ -159,37 +164,38 @@ def _start(function: Function, lock: int) -> _Worker:
     with ctrl_c_blocked():
         process.start()
     theirs.close()
-    # Not among the arguments: a process that died before it read more of them than a pipe holds would be waited for.
+    # Not among the arguments: if the process dies before it reads more than a pipe buffers, start() would block.
     with contextlib.suppress(ConnectionError):
         ours.send(function)
     return _Worker(process, ours)
 
 
 def _give(worker: _Worker, waiting: Iterator[Any]) -> bool:
-    """Hand the worker its next item; False when there is none."""
+    """Send the worker its next item; False after the last one."""
     worker.item = next(waiting, None)
     if worker.item is None:
         return False
-    with contextlib.suppress(ConnectionError):  # it is dead: found out when its answer does not come
+    with contextlib.suppress(ConnectionError):  # the worker is dead, which `_result_of` notices
         worker.connection.send(worker.item)
     return True
 
 
 def _ready(busy: list[_Worker]) -> list[_Worker]:
-    found = set(wait([worker.connection for worker in busy] + [worker.process.sentinel for worker in busy]))
-    return [worker for worker in busy if worker.connection in found or worker.process.sentinel in found]
+    """Workers with a result, and dead ones; waits for the first."""
+    ready = set(wait([worker.connection for worker in busy] + [worker.process.sentinel for worker in busy]))
+    return [worker for worker in busy if worker.connection in ready or worker.process.sentinel in ready]
 
 
 def _result_of(worker: _Worker) -> Any:
-    """The worker's answer. Raises what the function raised, and BadInput for a process that went by itself."""
+    """The worker's result. Raises the function's exception, and BadInput for a process that exited by itself."""
     try:
         result, problem = worker.connection.recv()
-    except (EOFError, OSError):  # OSError: in the middle of its answer
+    except (EOFError, OSError):  # OSError: while it sends its result
         worker.process.join()
         code = worker.process.exitcode or 0
-        if code >= 0:  # no fault of the item: such a process never began (a script without a __main__ guard)
+        if code >= 0:  # not caused by the item: the process did not start (a script without a __main__ guard)
             got = f"exit code {code}"
-            raise BadInput(worker.item, "a worker process that starts", got, "look at what it wrote above") from None
+            raise BadInput(worker.item, "a worker process that starts", got, "read its messages above") from None
         killed = "killed by SIGKILL, as the system does when memory runs out"
         return _Died(killed if code == -signal.SIGKILL else f"signal {signal.Signals(-code).name}")
     if problem is not None:
@@ -198,7 +204,7 @@ def _result_of(worker: _Worker) -> Any:
 
 
 class _Descriptor:
-    """A file descriptor that a spawned process receives as its own copy; -1 for none."""
+    """A file descriptor that is duplicated for a spawned process; -1 for none."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -212,7 +218,7 @@ def _received(copy: Any) -> _Descriptor:
 
 
 def _serve(connection: Connection, lock: _Descriptor) -> None:
-    """A worker's life. ``lock`` is held by being open until the process ends."""
+    """Main loop of a worker process. ``lock`` is a descriptor that stays open until the process ends."""
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # read by libraries that the function loads later
     begin_worker()
     try:
@@ -230,7 +236,7 @@ def _serve(connection: Connection, lock: _Descriptor) -> None:
 
 
 def _answer(function: Function, item: Any) -> tuple[Any, Exception | None]:
-    """The result, or what was raised."""
+    """The result or the exception."""
     try:
         return function(item), None
     except HoidataError as error:
@@ -239,35 +245,40 @@ def _answer(function: Function, item: Any) -> tuple[Any, Exception | None]:
         return None, RuntimeError(f"{item}: {traceback.format_exc()}")
 
 
-def choose_workers(where: str) -> None:
-    """Where the workers of this process are from now on.
+def choose_workers(backend: str) -> None:
+    """Choose the kind of workers for all later calls in this process.
 
-    where: "local" (processes), "dask" (a Dask cluster started here for each fan-out), or the address of a scheduler
-    such as tcp://host:8786. Raises BadInput for anything else, MissingResource without the extra.
+    Args:
+        backend: "local" (processes), "dask" (a Dask cluster started per call), or the address of a running scheduler
+            such as tcp://host:8786.
+
+    Raises:
+        BadInput: another backend.
+        MissingResource: Dask is not installed.
     """
-    if where not in (LOCAL, DASK) and "://" not in where:
+    if backend not in (LOCAL, DASK) and "://" not in backend:
         raise BadInput(
-            "workers", f"{LOCAL}, {DASK} or a scheduler's address such as tcp://host:8786", where, "correct it"
+            "workers", f"{LOCAL}, {DASK} or a scheduler's address such as tcp://host:8786", backend, "correct it"
         )
-    if where != LOCAL:
+    if backend != LOCAL:
         try:
             import distributed  # noqa: F401
         except ImportError as error:
             raise MissingResource("workers on Dask need the extra: pip install 'hoidata[dask]'") from error
-    _chosen[0] = where
+    _chosen[0] = backend
 
 
 def is_used_for(jobs: int) -> bool:
-    """Whether work for so many workers goes to a cluster: one that runs already always, a new one not for a single."""
+    """Whether work for ``jobs`` workers goes to a cluster; a new cluster is not started for a single worker."""
     return _chosen[0] not in (LOCAL, DASK) or (_chosen[0] == DASK and jobs > 1)
 
 
 def _on_cluster(
     function: Function, items: Sequence[Any], jobs: int, on_lost: Function | None
 ) -> Iterator[tuple[Any, Any]]:
-    """``in_workers`` on the chosen cluster. jobs: workers of a cluster started here.
+    """``in_workers`` on the chosen cluster. jobs: number of workers of a cluster started here.
 
-    A worker that dies costs its chunk, which others do again; a chunk that has ended several is done item by item.
+    The chunk of a dead worker is repeated by others. A chunk that ends several workers is split into single items.
     """
     from distributed import KilledWorker
 
@@ -276,7 +287,7 @@ def _on_cluster(
         size = max(1, math.ceil(len(items) / (CHUNKS_PER_WORKER * workers)))
         chunks = [list(items[start : start + size]) for start in range(0, len(items), size)]
 
-        # The function goes with every chunk: shared by `scatter` it would be lost with the workers that hold it.
+        # The function is sent with each chunk: after `scatter` it would be lost with the workers that store it.
         def submitted(chunk: list[Any]) -> Any:
             return client.submit(_work, function, chunk, os.getcwd(), pure=False)
 
@@ -285,15 +296,15 @@ def _on_cluster(
             for future in _done(client, running):
                 chunk = running.pop(future)
                 try:
-                    found = future.result()
-                except KilledWorker:  # also of a chunk that was done, whose result went with the worker that held it
+                    results = future.result()
+                except KilledWorker:  # also for a finished chunk whose worker died with the result
                     if len(chunk) == 1:
-                        error = WorkerLost(chunk[0], "each of several workers it was given to ended")
-                        yield chunk[0], _given_up(on_lost, error)
+                        error = WorkerLost(chunk[0], "several workers ended with it")
+                        yield chunk[0], _result_of_lost(on_lost, error)
                     else:
                         running |= {submitted([item]): [item] for item in chunk}
                     continue
-                for item, (result, problem) in zip(chunk, found, strict=True):
+                for item, (result, problem) in zip(chunk, results, strict=True):
                     if problem is not None:
                         raise problem
                     yield item, result
@@ -301,7 +312,7 @@ def _on_cluster(
 
 
 def _done(client: Any, running: Iterable[Any]) -> set[Any]:
-    """Those that have ended, once one has. Raises BadInput when there is no worker to wait for."""
+    """Wait for the first futures to finish. Raises BadInput if the cluster has no worker."""
     from distributed import wait as wait_for
 
     while True:
@@ -316,13 +327,13 @@ def _done(client: Any, running: Iterable[Any]) -> set[Any]:
 
 
 def _client(jobs: int) -> Any:
-    """A client of the chosen cluster; leaving it ends a cluster that was started for it."""
+    """A client of the chosen cluster; closing it ends a cluster that was started for it."""
     from distributed import Client
 
     if _chosen[0] == DASK:
-        # security: TLS with new certificates. Without it any user of this machine could run code as this one.
-        started = {"n_workers": jobs, "threads_per_worker": 1, "dashboard_address": None, "security": True}
-        return Client(**started, set_as_default=False)
+        # security: TLS with new certificates. Without it any user of this machine could run code as this user.
+        options = {"n_workers": jobs, "threads_per_worker": 1, "dashboard_address": None, "security": True}
+        return Client(**options, set_as_default=False)
     try:
         return Client(_chosen[0], timeout=PATIENCE_S, set_as_default=False)
     except OSError as error:
@@ -331,7 +342,7 @@ def _client(jobs: int) -> Any:
 
 
 def _work(function: Function, chunk: list[Any], folder: str) -> list[tuple[Any, Exception | None]]:
-    """In a worker: the results of a chunk, or what was raised; paths are those of the one that asks."""
+    """Results or exceptions of a chunk, in a cluster worker; ``folder`` is the working folder of the client."""
     os.chdir(folder)
     with one_thread():
         return [_answer(function, item) for item in chunk]

@@ -18,7 +18,7 @@ from hoidata.files.numpy_files import load_npz_arrays
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair
 from hoidata.object_paths import keyframed_path, read_keyframes
-from hoidata.object_paths.path import MOST_S, PathStep, check_pace
+from hoidata.object_paths.path import MAX_S, PathStep, check_pace
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.annotated import load_annotated
@@ -43,7 +43,7 @@ from pipelines.showing import find_clip
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
 
 LEAST_S = 0.3
-MOST_FRAMES = round(MOST_S * FPS) + 1
+MOST_FRAMES = round(MAX_S * FPS) + 1
 CLIPS_FOR_RANGE = 60  # of an object, whose hinge angles say how far it opens
 GENERATED = ("object_rotvec", "object_translation_m", "object_vertices_m", "object_faces", "object_part")
 
@@ -116,7 +116,7 @@ def asked_motion(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands
         asked = _lasting(asked, wish.length_s)
     if asked.thing.n_frames > MOST_FRAMES:
         got = f"{(asked.thing.n_frames - 1) / FPS:g} s"
-        raise BadInput("object's motion", f"at most {MOST_S:g} s", got, "make two of it, or tell a --length")
+        raise BadInput("object's motion", f"at most {MAX_S:g} s", got, "make two of it, or tell a --length")
     if wish.hinge_range and not asked.thing.model.is_articulated:
         note = "the object is rigid, so --hinge-range is not looked at; --hinge tells where it turns"
         asked = asked._replace(notes=[*asked.notes, note])
@@ -273,8 +273,8 @@ def _check_track(thing: ObjectTrack, path: Path) -> None:
 def _lasting(asked: Asked, seconds: float) -> Asked:
     """The same way in another time. Raises BadInput for a time that is none, or too short for it."""
     thing = asked.thing
-    if not LEAST_S <= seconds <= MOST_S:
-        raise BadInput("--length", f"{LEAST_S:g} to {MOST_S:g} s", f"{seconds:g} s", "ask for another length")
+    if not LEAST_S <= seconds <= MAX_S:
+        raise BadInput("--length", f"{LEAST_S:g} to {MAX_S:g} s", f"{seconds:g} s", "ask for another length")
     if thing.n_frames < 2:
         raise BadInput("--length", "a motion of two frames or more", "one frame", "leave it out")
     count = round(seconds * FPS) + 1

@@ -29,10 +29,10 @@ from urllib.parse import urlsplit
 
 import psutil
 
-from hoidata.beside import python_path
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.atomic import exclusive
 from hoidata.lifetime import end_with_parent
+from hoidata.package_paths import python_path
 
 KEY_FILE = Path(".prefect/api-key")
 START_TIMEOUT_S = 180

@@ -23,8 +23,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from hoidata.beside import python_path
 from hoidata.lifetime import end_on_signals
+from hoidata.package_paths import python_path
 from hoidata.processor import same_kernels
 
 SOCKET = "HOIDATA_WARM"

@@ -22,7 +22,7 @@ BESIDE = (
 )
 # A user's own packages, which have nothing to do with hoidata.
 USERS = "from models import mine\nfrom pipelines import own\nimport hoidata.errors\nprint(mine, own)"
-BOTH = "import models\nfrom hoidata.beside import add_to_path\nadd_to_path()"
+BOTH = "import models\nfrom hoidata.package_paths import add_to_path\nadd_to_path()"
 
 
 def run(python: Path, folder: Path, *words: str, **more: str) -> subprocess.CompletedProcess:

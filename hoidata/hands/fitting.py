@@ -1,9 +1,9 @@
 """Fit a MANO-layout hand to 3D keypoints: one shape, and wrist, orientation and finger pose per frame.
 
-Least squares by Levenberg-Marquardt (Marquardt 1963) from a start that turns each rest bone onto the observed one;
-10,000 hands take about 15 s on one core. Deterministic: no random numbers.
+Least squares by Levenberg-Marquardt (Marquardt 1963). The start rotates each rest bone onto the observed one. 10,000
+hands take about 15 s on one core. It uses no random numbers.
 
-Units metres and radians; keypoints in the order of the 21 joints (``hoidata.hands.JOINT_NAMES``).
+Units are metres and radians. Keypoints are in the order of the 21 joints (``hoidata.hands.JOINT_NAMES``).
 """
 
 from collections.abc import Mapping
@@ -16,36 +16,29 @@ from torch import Tensor
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.hands.model import N_JOINTS, N_SHAPE, TIP_VERTICES, HandModel, HandPair, Side
-from hoidata.hands.solver import FINGER_POINTS, Pose, Problem, pose_step, predict, settled, shape_step
+from hoidata.hands.solver import FINGER_POINTS, Pose, Problem, better_pose, pose_step, predict, shape_step
 from hoidata.hands.tracks import kinematics_of
 
 KNUCKLES = [1, 4, 7, 10, 13]
 THUMB = 4
-# Fingertips touch things, so they count most; knuckles and wrist are where datasets disagree about what a joint is.
+# Fingertips touch objects, so they count most. Datasets disagree about the positions of knuckles and wrist.
 DEFAULT_WEIGHTS = (1.0, *(1.0, 2.0, 3.0) * 5, *(6.0,) * 5)
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """weights: one per keypoint, of its squared error.
+    """Weights, priors and steps of a fit; angles are standard deviations around the model's mean pose."""
 
-    noise_m: error of a keypoint of weight 1 that is as (un)likely as one standard deviation of the priors.
-    bend_rad, spread_rad, twist_rad: standard deviations of a finger joint about its hinge axis, sideways, and about
-    its bone, around the model's mean pose; thumb_rad: of the thumb about either axis across its bone.
-    shake_rad: standard deviation of a finger joint from its mean over three neighbouring frames.
-    shape_frames: at most so many frames per hand, evenly spaced, decide the shape.
-    shape_prior: weight per frame of a standard normal prior on the shape. It grows with the frames because joint
-    definitions differ in the same way in all of them: without it, ManipNet's hands drive betas to 14.
-    """
-
-    weights: tuple[float, ...] = DEFAULT_WEIGHTS
-    noise_m: float = 0.003
-    bend_rad: float = 1.5
-    spread_rad: float = 0.25
-    twist_rad: float = 0.2
-    thumb_rad: float = 1.0
-    shake_rad: float = 0.1
-    shape_frames: int = 100
+    weights: tuple[float, ...] = DEFAULT_WEIGHTS  # (21,) of each keypoint's squared error
+    noise_m: float = 0.003  # standard deviation of a keypoint of weight 1
+    bend_rad: float = 1.5  # of a finger joint about its hinge axis
+    spread_rad: float = 0.25  # of a finger joint sideways
+    twist_rad: float = 0.2  # of a finger joint about its bone
+    thumb_rad: float = 1.0  # of a thumb joint about both axes across its bone
+    shake_rad: float = 0.1  # of a finger joint from its mean over three neighbouring frames
+    shape_frames: int = 100  # most frames per hand that determine the shape, evenly spaced
+    # Weight per frame of a standard normal prior on the shape. It grows with the frames because joint definitions
+    # differ in the same way in all frames. Without it, ManipNet's hands lead to betas of 14.
     shape_prior: float = 0.3
     shape_steps: int = 12
     pose_steps: int = 15
@@ -53,16 +46,13 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class HandFit:
-    """wrist_m: (frame, 3); global_orient: (frame, 3); hand_pose: (frame, 45) absolute; betas: (1, 10).
+    """A fitted hand, float64, world frame."""
 
-    error_m: (frame, 21) distance of each keypoint from the fitted hand; NaN where none was given.
-    """
-
-    wrist_m: np.ndarray
-    global_orient: np.ndarray
-    hand_pose: np.ndarray
-    betas: np.ndarray
-    error_m: np.ndarray
+    wrist_m: np.ndarray  # (frame, 3)
+    global_orient: np.ndarray  # (frame, 3) axis-angle
+    hand_pose: np.ndarray  # (frame, 45) axis-angles, absolute
+    betas: np.ndarray  # (1, 10)
+    error_m: np.ndarray  # (frame, 21) distance of each keypoint from the fitted hand; NaN for an unknown keypoint
 
 
 def fit_hands(
@@ -71,11 +61,16 @@ def fit_hands(
     betas: np.ndarray | None = None,
     settings: FitSettings | None = None,
 ) -> dict[Side, HandFit]:
-    """Fit both (or one) of a person's hands over consecutive frames.
+    """Fit one or both hands of a person over consecutive frames.
 
-    keypoints_m: per side (frame, 21, 3) world positions, metres; NaN where a keypoint is unknown.
-    betas: (10,) the known shape; by default it is fitted first (``fit_shape``), one for both sides.
-    Raises BadInput for another shape of array or a frame without at least three known keypoints on the palm.
+    Args:
+        keypoints_m: per side (frame, 21, 3) world positions; NaN for an unknown keypoint.
+        hands: models of both sides.
+        betas: (10,) the shape, if known. By default one shape of both sides is fitted first (``fit_shape``).
+        settings: weights, priors and steps.
+
+    Raises:
+        BadInput: an array of another shape, or a frame with less than three known keypoints on the palm.
     """
     settings = settings or FitSettings()
     if betas is None:
@@ -87,9 +82,9 @@ def fit_hands(
 def fit_shape(
     keypoints_m: Mapping[Side, np.ndarray], hands: HandPair, settings: FitSettings | None = None
 ) -> np.ndarray:
-    """The one shape (10,) that explains the keypoints of both sides best, under a standard normal prior.
+    """Fit one shape (10,) to the keypoints of both sides, under a standard normal prior.
 
-    Frames need not be consecutive; ``settings.shape_frames`` of them per side, evenly spaced, are used.
+    Up to ``settings.shape_frames`` evenly spaced frames per side are used. They need not be consecutive.
     """
     settings = replace(settings or FitSettings(), shake_rad=np.inf)
     problems, poses = [], []
@@ -101,8 +96,8 @@ def fit_shape(
     n_frames = sum(len(problem.keypoints) for problem in problems)
     prior = settings.noise_m**2 * max(1.0, settings.shape_prior * n_frames)
     for _ in range(settings.shape_steps):
-        betas, moved = shape_step(problems, poses, betas, prior)
-        poses = [settled(*pair, betas) for pair in zip(problems, moved, poses, strict=True)]
+        betas, trials = shape_step(problems, poses, betas, prior)
+        poses = [better_pose(*triple, betas) for triple in zip(problems, trials, poses, strict=True)]
     return betas[0].numpy()
 
 
@@ -126,16 +121,16 @@ def _problem(side: Side, points: np.ndarray, model: HandModel, settings: FitSett
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 3 or points.shape[1:] != (N_JOINTS, 3) or not len(points):
         raise BadInput(f"{side} hand keypoints", "an array (frame, 21, 3)", f"shape {points.shape}", "check the caller")
-    known = np.asarray(np.isfinite(points).all(axis=-1))
-    palm = known[:, [0, *KNUCKLES]].sum(axis=1)
+    is_known = np.asarray(np.isfinite(points).all(axis=-1))
+    palm = is_known[:, [0, *KNUCKLES]].sum(axis=1)
     if palm.min() < 3:
         got = f"{palm.min()} in frame {palm.argmin()}"
-        raise BadInput(f"{side} hand keypoints", "3 known ones on the palm", got, "leave such frames out")
+        raise BadInput(f"{side} hand keypoints", "3 known keypoints on the palm", got, "omit such frames")
     rest = np.concatenate((model.rest_joints_m(np.zeros((1, N_SHAPE)))[0], model.template_m[list(TIP_VERTICES)]))
     return Problem(
         layer=kinematics_of(model, torch.float64),
-        keypoints=torch.from_numpy(np.where(known[..., None], points, 0.0)),
-        weights=torch.from_numpy(known * np.asarray(settings.weights)),
+        keypoints=torch.from_numpy(np.where(is_known[..., None], points, 0.0)),
+        weights=torch.from_numpy(is_known * np.asarray(settings.weights)),
         rest=torch.from_numpy(rest),
         prior_mean=torch.from_numpy(model.mean_pose.reshape(5, 9)),
         prior=torch.from_numpy(pose_precision(rest, settings)),
@@ -144,9 +139,13 @@ def _problem(side: Side, points: np.ndarray, model: HandModel, settings: FitSett
 
 
 def pose_precision(rest: np.ndarray, settings: FitSettings) -> np.ndarray:
-    """Precision (5, 9, 9) of each finger's axis-angles, in units of squared metres.
+    """Precision (5, 9, 9) of the prior of each finger's axis-angles, times the squared noise, in squared metres.
 
-    The hinge axis lies across the bone in the plane of the palm; a thumb bends about any axis across its bone.
+    The hinge axis is across the bone in the plane of the palm. A thumb bends about any axis across its bone.
+
+    Args:
+        rest: (21, 3) keypoints at rest.
+        settings: standard deviations.
     """
     palm_normal = _unit(np.cross(rest[1] - rest[0], rest[7] - rest[0]))
     precision = np.zeros((5, 9, 9))
@@ -156,8 +155,8 @@ def pose_precision(rest: np.ndarray, settings: FitSettings) -> np.ndarray:
             bone = _unit(rest[points[joint + 1]] - rest[points[joint]])
             hinge = _unit(np.cross(palm_normal, bone))
             axes = np.stack((hinge, np.cross(bone, hinge), bone))
-            rows = slice(3 * joint, 3 * joint + 3)
-            precision[finger, rows, rows] = axes.T @ np.diag(np.array([*across, settings.twist_rad]) ** -2.0) @ axes
+            block = slice(3 * joint, 3 * joint + 3)
+            precision[finger, block, block] = axes.T @ np.diag(np.array([*across, settings.twist_rad]) ** -2.0) @ axes
     return precision * settings.noise_m**2
 
 
@@ -166,7 +165,7 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def _initial_pose(problem: Problem) -> Pose:
-    """Palm by the best rigid fit of wrist and knuckles, fingers by turning each rest bone onto the observed one."""
+    """Palm by a rigid fit of wrist and knuckles, fingers by rotating each rest bone onto the observed one."""
     wrist, orient = _rigid_fit(problem)
     fingers = torch.zeros(len(wrist), 5, 3, 3, dtype=wrist.dtype)
     chain = torch.tensor(FINGER_POINTS)
@@ -174,34 +173,34 @@ def _initial_pose(problem: Problem) -> Pose:
     for joint in range(3):
         start, end = chain[:, joint], chain[:, joint + 1]
         bone = problem.keypoints[:, end] - problem.keypoints[:, start]
-        known = (problem.weights[:, end] > 0) & (problem.weights[:, start] > 0) & (bone.norm(dim=-1) > 1e-6)
+        is_known = (problem.weights[:, end] > 0) & (problem.weights[:, start] > 0) & (bone.norm(dim=-1) > 1e-6)
         local = (parent.transpose(-1, -2) @ bone[..., None])[..., 0]
-        turn = _shortest_turn(problem.rest[end] - problem.rest[start], local)
-        fingers[:, :, joint] = torch.where(known[..., None], turn, 0.0)
+        rotation = _shortest_rotation(problem.rest[end] - problem.rest[start], local)
+        fingers[:, :, joint] = torch.where(is_known[..., None], rotation, 0.0)
         parent = parent @ rotvec_to_rotmat(fingers[:, :, joint])
     return Pose(wrist, orient, fingers)
 
 
 def _rigid_fit(problem: Problem) -> tuple[Tensor, Tensor]:
-    """Wrist (frame, 3) and world-from-hand (frame, 3, 3) that lay the rest palm on the keypoints (Kabsch 1976)."""
+    """Wrist (frame, 3) and world-from-hand (frame, 3, 3) of the best rigid fit of the palm (Kabsch 1976)."""
     palm = [0, *KNUCKLES]
     weight = (problem.weights[:, palm] > 0).to(problem.keypoints.dtype)[..., None]
     total = weight.sum(1)
     rest = problem.rest[palm].expand(len(weight), -1, -1)
-    rest_centre, seen_centre = (rest * weight).sum(1) / total, (problem.keypoints[:, palm] * weight).sum(1) / total
-    spread = ((problem.keypoints[:, palm] - seen_centre[:, None]) * weight).transpose(1, 2) @ (
+    rest_centre, target_centre = (rest * weight).sum(1) / total, (problem.keypoints[:, palm] * weight).sum(1) / total
+    spread = ((problem.keypoints[:, palm] - target_centre[:, None]) * weight).transpose(1, 2) @ (
         rest - rest_centre[:, None]
     )
     left, _, right = torch.linalg.svd(spread)
     sign = torch.ones_like(total).expand(-1, 3).clone()
-    sign[:, 2] = torch.linalg.det(left @ right)
+    sign[:, 2] = torch.linalg.det(left @ right)  # a proper rotation, not a reflection
     orient = left @ (sign[..., None] * right)
     offset = problem.rest[0] - rest_centre
-    return seen_centre + (orient @ offset[..., None])[..., 0], orient
+    return target_centre + (orient @ offset[..., None])[..., 0], orient
 
 
-def _shortest_turn(bone: Tensor, target: Tensor) -> Tensor:
-    """Axis-angle (frame, 5, 3) that turns ``bone`` (5, 3) into the direction of ``target`` (frame, 5, 3)."""
+def _shortest_rotation(bone: Tensor, target: Tensor) -> Tensor:
+    """Axis-angle (frame, 5, 3) of the smallest rotation from ``bone`` (5, 3) to ``target`` (frame, 5, 3)."""
     bone, target = torch.broadcast_tensors(bone, target)
     axis = torch.linalg.cross(bone, target, dim=-1)
     angle = torch.atan2(axis.norm(dim=-1), (bone * target).sum(-1))

@@ -1,8 +1,7 @@
 """Forward kinematics of a MANO-layout hand in torch: linear blend skinning with shape and pose blend shapes.
 
-World convention of hoidata: joint 0 lies exactly at ``wrist_m``, and the hand turns about it. A MANO file's own
-translation relates by ``wrist_m = transl + J0(betas)``. Model: Romero et al. 2017; skinning:
-Loper et al. 2015, eq. 2-9.
+World convention of hoidata: joint 0 is at ``wrist_m``, and the hand rotates about it. MANO's translation is related by
+``wrist_m = transl + J0(betas)``. Model: Romero et al. 2017. Skinning: Loper et al. 2015, Eq. 2-9.
 """
 
 from collections.abc import Sequence
@@ -16,38 +15,42 @@ _LEVELS = ((1, 4, 7, 10, 13), (2, 5, 8, 11, 14), (3, 6, 9, 12, 15))
 
 
 class HandKinematics(nn.Module):
-    """Batched joints and vertices of one side, metres in the world frame, differentiable in every input.
-
-    dtype: torch.float32 or torch.float64, of the buffers and hence of what the inputs must be.
-    """
+    """Batched joints and vertices of one side, metres in the world frame, differentiable in all inputs."""
 
     template_m: Tensor
     joint_regressor: Tensor
     rest_joints_m: Tensor
     joint_directions: Tensor
-    # Where to look, beside the data on its device: a list would be sent there at every call.
+    # Indices are buffers on the device of the data. A list would be copied to the device at each call.
     parents: Tensor
     levels: Tensor
     tip_vertices: Tensor
 
     def __init__(self, model: HandModel, dtype: torch.dtype = torch.float32) -> None:
+        """dtype: torch.float32 or torch.float64, of the buffers and of all inputs."""
         super().__init__()
         self.side, self.digest = model.side, model.digest
         arrays = {name: getattr(model, name) for name in ("template_m", "joint_regressor", "joint_directions")}
         arrays["rest_joints_m"] = model.joint_regressor @ model.template_m
         for name, value in arrays.items():
             self.register_buffer(name, torch.as_tensor(value, dtype=dtype).contiguous(), persistent=False)
-        for name, places in (("parents", PARENTS[1:]), ("levels", _LEVELS), ("tip_vertices", TIP_VERTICES)):
-            self.register_buffer(name, torch.tensor(places), persistent=False)
+        for name, indices in (("parents", PARENTS[1:]), ("levels", _LEVELS), ("tip_vertices", TIP_VERTICES)):
+            self.register_buffer(name, torch.tensor(indices), persistent=False)
         self.mesh = _Skin(model, range(len(model.template_m)), dtype)
         self.tips = _Skin(model, TIP_VERTICES, dtype)
 
     def joints(self, wrist_m: Tensor, rotmats: Tensor, betas: Tensor, template_m: Tensor | None = None) -> Tensor:
-        """(batch, 21, 3) joints without skinning the mesh: only the five tip vertices are.
+        """Joints without skinning the whole mesh.
 
-        wrist_m: (batch, 3) world position of joint 0. rotmats: (batch, 16, 3, 3) local rotations, the first one
-        world-from-hand, the others relative to the parent joint; absolute, the identity is the flat hand.
-        betas: (batch or 1, 10). template_m: (778, 3) or (batch, 778, 3) personal rest mesh.
+        Args:
+            wrist_m: (batch, 3) world position of joint 0.
+            rotmats: (batch, 16, 3, 3) local rotations: world-from-hand, then relative to the parent joint. Identities
+                give the flat hand.
+            betas: (batch or 1, 10) shape coefficients.
+            template_m: (778, 3) or (batch, 778, 3) personal rest mesh.
+
+        Returns:
+            (batch, 21, 3) joints, world.
         """
         rotations, positions, rest = self._chain(wrist_m, rotmats, betas, template_m)
         tips = self.tips(rotmats, betas, rotations, positions, rest, template_m)
@@ -83,18 +86,18 @@ class HandKinematics(nn.Module):
 
 
 class _Skin(nn.Module):
-    """Blend shapes and skinning of some vertices of a model, coordinate-major so that every sum is one matmul."""
+    """Blend shapes and skinning of some vertices, coordinate-major so that each sum is one matrix product."""
 
     template: Tensor
     weights: Tensor
     shape: Tensor
     pose: Tensor
-    rows: Tensor
+    vertex_ids: Tensor
 
     def __init__(self, model: HandModel, vertices: Sequence[int], dtype: torch.dtype) -> None:
         super().__init__()
         self.vertices = list(vertices)
-        self.register_buffer("rows", torch.tensor(self.vertices), persistent=False)
+        self.register_buffer("vertex_ids", torch.tensor(self.vertices), persistent=False)
         self.is_whole = len(self.vertices) == len(model.template_m)
         shape = model.shape_directions[self.vertices].transpose(2, 1, 0).reshape(N_SHAPE, -1)
         pose = model.pose_directions[self.vertices].transpose(2, 1, 0).reshape(model.pose_directions.shape[2], -1)
@@ -116,12 +119,12 @@ class _Skin(nn.Module):
         moves = torch.cat((rotations, (positions[..., None] - rotations @ rest[..., None])), -1)
         blended = moves.reshape(n_batch, N_ROTATIONS, 12).transpose(1, 2) @ self.weights
         x, y, z, shift = blended.reshape(n_batch, 3, 4, -1).unbind(2)
-        rested = self._rested(rotmats, betas, template_m)
-        placed = x * rested[:, :1] + y * rested[:, 1:2] + z * rested[:, 2:] + shift
-        return placed.transpose(1, 2).contiguous()
+        rest_vertices = self._rest_vertices(rotmats, betas, template_m)
+        posed = x * rest_vertices[:, :1] + y * rest_vertices[:, 1:2] + z * rest_vertices[:, 2:] + shift
+        return posed.transpose(1, 2).contiguous()
 
-    def _rested(self, rotmats: Tensor, betas: Tensor, template_m: Tensor | None) -> Tensor:
-        """Rest positions with shape and pose blend shapes, (batch, 3, vertex)."""
+    def _rest_vertices(self, rotmats: Tensor, betas: Tensor, template_m: Tensor | None) -> Tensor:
+        """(batch, 3, vertex) rest positions with shape and pose blend shapes."""
         identity = torch.eye(3, dtype=rotmats.dtype, device=rotmats.device)
         features = (rotmats[:, 1:] - identity).reshape(len(rotmats), -1)
         shaped = (betas @ self.shape).reshape(-1, 3, len(self.vertices)) + self._template(template_m)
@@ -130,4 +133,4 @@ class _Skin(nn.Module):
     def _template(self, template_m: Tensor | None) -> Tensor:
         if template_m is None:
             return self.template
-        return (template_m if self.is_whole else template_m[..., self.rows, :]).transpose(-1, -2)
+        return (template_m if self.is_whole else template_m[..., self.vertex_ids, :]).transpose(-1, -2)

@@ -1,8 +1,8 @@
-"""Read the user's own MANO files (Romero et al. 2017) without chumpy and without executing what is in them.
+"""Read MANO files (Romero et al. 2017) without chumpy and without executing their pickles.
 
-The released files are Python 2 pickles that hold chumpy and SciPy objects. Those are read as inert records and
-evaluated here. The widespread correction of the left hand's shape directions is not applied: H2O, GRAB and ARCTIC were
-fitted with the file as it is.
+The released files are Python 2 pickles with chumpy and SciPy objects. These are read as inert records and evaluated
+here. The widespread correction of the left hand's shape directions is not applied: H2O, GRAB and ARCTIC were fitted
+with the unmodified file.
 """
 
 from pathlib import Path
@@ -40,7 +40,7 @@ _ALLOW = {
     ("scipy.sparse.csc", "csc_matrix"): _Csc,
     ("scipy.sparse._csc", "csc_matrix"): _Csc,
 }
-# Our fields, and MANO's names for them.
+# Field of HandModel: key of a MANO file.
 MANO_KEYS = {
     "template_m": "v_template",
     "shape_directions": "shapedirs",
@@ -55,10 +55,14 @@ MANO_KEYS = {
 
 
 def load_mano_hands(folder: str | Path) -> HandPair:
-    """Both hands of a MANO download, named "mano".
+    """Load both hands of a MANO download, named "mano".
 
-    folder: where MANO_LEFT.pkl and MANO_RIGHT.pkl lie, or the unpacked ``mano_v1_2`` above their ``models`` folder.
-    Raises MissingResource when a file is absent and BadInput when one cannot be a MANO file.
+    Args:
+        folder: the folder of MANO_LEFT.pkl and MANO_RIGHT.pkl, or the unpacked ``mano_v1_2``.
+
+    Raises:
+        MissingResource: a file is missing.
+        BadInput: a file is not a MANO file.
     """
     return HandPair(left=_load_side(Path(folder), "left"), right=_load_side(Path(folder), "right"))
 
@@ -94,13 +98,13 @@ def _fields(path: Path, content: dict[str, Any]) -> dict[str, np.ndarray]:
     return values
 
 
-def _dense(where: str, value: Any) -> np.ndarray:
-    """Evaluate a record; plain arrays pass."""
+def _dense(source: str, value: Any) -> np.ndarray:
+    """Evaluate a record; a plain array is returned unchanged."""
     try:
         if isinstance(value, _Ch):
-            return _dense(where, value.state["x"])
+            return _dense(source, value.state["x"])
         if isinstance(value, _Select):
-            flat = _dense(where, value.state["a"]).ravel()
+            flat = _dense(source, value.state["a"]).ravel()
             return flat[np.asarray(value.state["idxs"])].reshape(value.state["preferred_shape"])
         if isinstance(value, _Csc):
             return _dense_csc(value.state)
@@ -108,21 +112,21 @@ def _dense(where: str, value: Any) -> np.ndarray:
             return value
     except (KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
         got = f"{type(error).__name__}: {error}"
-        raise BadInput(where, "a chumpy or SciPy object as MANO has them", got, _REMEDY) from None
-    raise BadInput(where, "an array", type(value).__name__, _REMEDY)
+        raise BadInput(source, "a chumpy or SciPy object as MANO has them", got, _REMEDY) from None
+    raise BadInput(source, "an array", type(value).__name__, _REMEDY)
 
 
 def _dense_csc(state: dict[str, Any]) -> np.ndarray:
     rows, columns = (int(length) for length in state["_shape"])
     if not (0 < rows <= 1024 and 0 < columns <= 1024):
         raise ValueError(f"matrix of shape {(rows, columns)}")
-    data, row, start = (np.asarray(state[key]) for key in ("data", "indices", "indptr"))
-    if start.shape != (columns + 1,) or start[0] != 0 or start[-1] != len(row) or len(row) != len(data):
+    data, row_index, start = (np.asarray(state[key]) for key in ("data", "indices", "indptr"))
+    if start.shape != (columns + 1,) or start[0] != 0 or start[-1] != len(row_index) or len(row_index) != len(data):
         raise ValueError("column pointers that do not fit the data")
-    if (np.diff(start) < 0).any() or (len(row) and not 0 <= row.min() <= row.max() < rows):
+    if (np.diff(start) < 0).any() or (len(row_index) and not 0 <= row_index.min() <= row_index.max() < rows):
         raise ValueError("row indices outside the matrix")
     dense = np.zeros((rows, columns))
-    np.add.at(dense, (row, np.repeat(np.arange(columns), np.diff(start))), data)
+    np.add.at(dense, (row_index, np.repeat(np.arange(columns), np.diff(start))), data)
     return dense
 
 
@@ -138,5 +142,5 @@ def _check_side(path: Path, model: HandModel) -> None:
     joints = model.joint_regressor @ model.template_m
     points_to_minus_x = joints[4, 0] < joints[0, 0]
     if points_to_minus_x != (model.side == "right"):
-        remedy = "give the two files their original names back"
-        raise BadInput(path, f"a {model.side} hand", "fingers that point like the other hand's", remedy)
+        remedy = "restore the original names of the two files"
+        raise BadInput(path, f"a {model.side} hand", "fingers that point in the direction of the other hand's", remedy)

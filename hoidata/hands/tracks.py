@@ -14,7 +14,7 @@ _CHUNK_FRAMES = 512
 
 
 class HandTrackLike(Protocol):
-    """What ``hoidata.clips.HandTrack`` offers; units and shapes as there."""
+    """Protocol of ``hoidata.clips.HandTrack``; units and shapes are documented there."""
 
     @property
     def wrist_m(self) -> np.ndarray: ...
@@ -31,23 +31,23 @@ class HandTrackLike(Protocol):
 
 
 def track_joints(track: HandTrackLike, model: HandModel) -> np.ndarray:
-    """(frame, 21, 3) float32 world joints, metres, of every frame of the track, valid or not."""
+    """(frame, 21, 3) float32 world joints of all frames, valid or not."""
     return _in_chunks(track, model, N_JOINTS, lambda layer, inputs: layer.joints(*inputs))
 
 
 def track_vertices(track: HandTrackLike, model: HandModel) -> np.ndarray:
-    """(frame, 778, 3) float32 world vertices, metres, of every frame of the track, valid or not."""
+    """(frame, 778, 3) float32 world vertices of all frames, valid or not."""
     return _in_chunks(track, model, len(model.template_m), lambda layer, inputs: layer(*inputs)[0])
 
 
 @lru_cache(maxsize=8)
 def kinematics_of(model: HandModel, dtype: torch.dtype = torch.float32) -> HandKinematics:
-    """The shared HandKinematics of a model on the CPU, made once per model object and dtype."""
+    """The cached HandKinematics of a model on the CPU, one per model object and dtype."""
     return HandKinematics(model, dtype)
 
 
 def track_rotmats(track: HandTrackLike) -> np.ndarray:
-    """(frame, 16, 3, 3) local rotations of a track, the global one first."""
+    """(frame, 16, 3, 3) local rotations of a track, the global orientation first."""
     rotvec = np.concatenate((track.global_orient, track.hand_pose), axis=1, dtype=np.float64)
     return rotvec_to_rotmat(rotvec.reshape(len(rotvec), N_ROTATIONS, 3))
 
@@ -63,7 +63,7 @@ def _in_chunks(track: HandTrackLike, model: HandModel, n_points: int, run) -> np
     out = np.empty((len(wrist), n_points, 3), dtype=np.float32)
     with torch.no_grad():
         for start in range(0, len(wrist), _CHUNK_FRAMES):
-            rows = slice(start, start + _CHUNK_FRAMES)
-            own_betas = betas if len(betas) == 1 else betas[rows]
-            out[rows] = run(layer, (wrist[rows], rotmats[rows], own_betas, template)).numpy()
+            frames = slice(start, start + _CHUNK_FRAMES)
+            chunk_betas = betas if len(betas) == 1 else betas[frames]
+            out[frames] = run(layer, (wrist[frames], rotmats[frames], chunk_betas, template)).numpy()
     return out

@@ -1,10 +1,13 @@
 """Keyframes of an object's motion, from CSV or JSON.
 
-A row (or JSON object) per key; its names carry the unit. ``time_s``; ``x_m y_m z_m`` (or ``_cm``, ``_mm``): the way
-from where the object stands at first, z its height above the table; ``qw qx qy qz``, or an axis-angle ``rx_deg ry_deg
-rz_deg`` (or ``_rad``): its turn about its middle; ``hinge_deg`` (or ``hinge_rad``): 0 is as the mesh is drawn. What is
-left out stays at zero. Turns about one axis are taken as they are written: ``rz_deg`` 0, then 360 is once round. JSON:
-a list of such objects, or ``{"keyframes": [...]}``.
+CSV has one row per keyframe; JSON is a list of objects, or ``{"keyframes": [...]}``. Column names carry the unit:
+
+- ``time_s`` or ``time_ms``.
+- ``x_m y_m z_m`` (or ``_cm``, ``_mm``): translation from the start; z is the height above the table.
+- ``qw qx qy qz``, or an axis-angle ``rx_deg ry_deg rz_deg`` (or ``_rad``): rotation about the object's centre.
+- ``hinge_deg`` (or ``hinge_rad``): hinge angle; 0 is the angle of the mesh file.
+
+Missing columns are zero. Rotations about a single axis may exceed half a turn: ``rz_deg`` 0, then 360 is a full turn.
 """
 
 import csv
@@ -20,11 +23,12 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
-from hoidata.object_paths.path import MOST_S, ObjectPath, PathStep, check_mean_rate, checked_path, frame_times, smooth
+from hoidata.object_paths.path import MAX_S, ObjectPath, PathStep, check_mean_rate, checked_path, frame_times, smooth
 from hoidata.objects.model import ObjectModel
 
-MOST_BYTES, MOST_KEYS = 2**20, 5000
-MOST_TURN_RAD = np.radians(170)  # between keys, where the way round is not told
+MAX_BYTES, MAX_KEYS = 2**20, 5000
+# Between keyframes about different axes. Near half a turn the direction of the rotation is ambiguous.
+MAX_ROTATION_RAD = np.radians(170)
 SAME_AXIS_RAD = 1e-6
 _FACTORS = {"s": 1.0, "ms": 1e-3, "m": 1.0, "cm": 0.01, "mm": 0.001, "rad": 1.0, "deg": float(np.pi / 180)}
 _UNITS = {name: ("m", "cm", "mm") for name in "xyz"} | {name: ("deg", "rad") for name in ("rx", "ry", "rz", "hinge")}
@@ -37,103 +41,109 @@ _COLUMNS = {f"{name}_{unit}": (name, _FACTORS[unit]) for name, units in _UNITS.i
 
 @dataclass(frozen=True, eq=False)
 class Keyframes:
-    """time_s (key,) rising from 0; shift_m (key, 3); rotmats (key, 3, 3); hinge_rad (key,), None where not told.
+    """Keyframes of one object; rotation and translation are relative to its pose at the start."""
 
-    rotvec_rad: (key, 3) the turns as they were written, of any length; None of quaternions.
-    """
-
-    time_s: np.ndarray
-    shift_m: np.ndarray
-    rotmats: np.ndarray
-    hinge_rad: np.ndarray | None
-    rotvec_rad: np.ndarray | None = None
+    time_s: np.ndarray  # (key,) ascending from 0
+    shift_m: np.ndarray  # (key, 3)
+    rotmats: np.ndarray  # (key, 3, 3)
+    hinge_rad: np.ndarray | None  # (key,), None without a hinge column
+    rotvec_rad: np.ndarray | None = None  # (key, 3) axis-angles of any length, None for quaternions
 
 
 def read_keyframes(path: str | Path) -> Keyframes:
-    """Keyframes of a .csv or .json file. Raises BadInput that says which row, what was expected, and what to do."""
+    """Read keyframes from a .csv or .json file. Raises BadInput for a file or value that cannot be used."""
     path = Path(path)
     if not path.is_file():
-        raise BadInput(path, "a .csv or .json file of keyframes", "nothing there", "correct the path")
-    if path.stat().st_size > MOST_BYTES:
-        raise BadInput(path, f"at most {MOST_BYTES} bytes", f"{path.stat().st_size}", "leave keys out")
+        raise BadInput(path, "a .csv or .json file of keyframes", "no file", "correct the path")
+    if path.stat().st_size > MAX_BYTES:
+        raise BadInput(path, f"at most {MAX_BYTES} bytes", f"{path.stat().st_size}", "use fewer keyframes")
     return parse_keyframes(path.read_bytes(), str(path))
 
 
-def parse_keyframes(data: bytes, where: str) -> Keyframes:
-    """The same from any bytes: JSON where they begin with a bracket, else CSV."""
+def parse_keyframes(data: bytes, source: str) -> Keyframes:
+    """Parse JSON if ``data`` begins with a bracket, else CSV. source: where it is from, for messages."""
     try:
         text = data.decode("utf-8-sig")
-        rows = _json_rows(text, where) if text.lstrip()[:1] in ("[", "{") else _csv_rows(text, where)
+        rows = _json_rows(text, source) if text.lstrip()[:1] in ("[", "{") else _csv_rows(text, source)
     except (UnicodeDecodeError, csv.Error, json.JSONDecodeError, RecursionError) as error:
-        raise BadInput(where, "CSV or JSON text", f"{type(error).__name__}: {error}", "export it anew") from error
-    if not 2 <= len(rows) <= MOST_KEYS:
-        raise BadInput(where, f"2 to {MOST_KEYS} keyframes", f"{len(rows)}", "add or leave out keys")
-    return _keyframes(_columns(rows, where), len(rows), where)
+        raise BadInput(source, "CSV or JSON text", f"{type(error).__name__}: {error}", "export it again") from error
+    if not 2 <= len(rows) <= MAX_KEYS:
+        raise BadInput(source, f"2 to {MAX_KEYS} keyframes", f"{len(rows)}", "add or remove keyframes")
+    return _keyframes(_columns(rows, source), len(rows), source)
 
 
 def keyframed_path(
     model: ObjectModel,
     keys: Keyframes,
     limits_rad: tuple[float, float] | None = None,
-    where: str = "keyframes",
+    source: str = "keyframes",
     standing: np.ndarray | None = None,
 ) -> ObjectPath:
-    """The motion through keyframes; each is reached at its time. limits_rad: stops of the hinge, where they are known.
+    """Interpolate keyframes to 30 frames per second; the object reaches each keyframe at its time.
 
-    standing: as in ``checked_path``. Raises BadInput for a hinge angle of a rigid object, and for what ``checked_path``
-    refuses.
+    Args:
+        model: the object.
+        keys: the keyframes.
+        limits_rad: smallest and largest hinge angle, if known.
+        source: where the keyframes are from, for messages.
+        standing: as in ``checked_path``.
+
+    Raises:
+        BadInput: a rigid object with hinge angles, an ambiguous rotation, or a path that ``checked_path`` refuses.
     """
     if keys.hinge_rad is not None and keys.hinge_rad.any() and not model.is_articulated:
-        remedy = 'tell the hinge (--hinge "px,py,pz dx,dy,dz"), or leave the column out'
-        raise BadInput(where, f"no hinge angle: {model.name!r} is rigid", "a column hinge_...", remedy)
+        remedy = 'give the hinge (--hinge "px,py,pz dx,dy,dz"), or remove the column'
+        raise BadInput(source, f"no hinge angle: {model.name!r} is rigid", "a column hinge_...", remedy)
     steps = [
         PathStep(f"keyframes {number + 1} to {number + 2}", float(start), float(end))
         for number, (start, end) in enumerate(zip(keys.time_s[:-1], keys.time_s[1:], strict=True))
     ]
     hinge = np.zeros(len(keys.time_s)) if keys.hinge_rad is None else keys.hinge_rad
-    turns = _turns(keys, where)
-    for step, way, turn, swing in zip(
-        steps, np.diff(keys.shift_m, axis=0), turns, np.diff(hinge)[:, None], strict=True
+    rotations = _rotations_between(keys, source)
+    for step, shift, rotation, swing in zip(
+        steps, np.diff(keys.shift_m, axis=0), rotations, np.diff(hinge)[:, None], strict=True
     ):
-        check_mean_rate(step, way, "m/s")
-        check_mean_rate(step, turn, "rad/s")
+        check_mean_rate(step, shift, "m/s")
+        check_mean_rate(step, rotation, "rad/s")
         check_mean_rate(step, swing, "rad/s of the hinge")
     at_s = frame_times(float(keys.time_s[-1]))
-    shift, angle = smooth(keys.time_s, keys.shift_m, at_s), smooth(keys.time_s, hinge, at_s)
-    turned = _turned(keys, turns, at_s)
-    return checked_path(model, shift, turned, angle, steps, limits_rad, standing)
+    shift_m, hinge_rad = smooth(keys.time_s, keys.shift_m, at_s), smooth(keys.time_s, hinge, at_s)
+    rotmats = _interpolated_rotations(keys, rotations, at_s)
+    return checked_path(model, shift_m, rotmats, hinge_rad, steps, limits_rad, standing)
 
 
-def _turns(keys: Keyframes, where: str) -> np.ndarray:
-    """(key - 1, 3) turn from each key to the next: as far round as it is written about one axis, else the shorter way.
+def _rotations_between(keys: Keyframes, source: str) -> np.ndarray:
+    """(key - 1, 3) axis-angle from each keyframe to the next.
 
-    Raises BadInput where the shorter way may not be the one that is meant.
+    About a single axis the written angle counts, so that it may exceed half a turn. Otherwise it is the smaller
+    rotation. Raises BadInput if that is ambiguous.
     """
     shorter = rotmat_to_rotvec(keys.rotmats[1:] @ keys.rotmats[:-1].swapaxes(1, 2))
     written = shorter if keys.rotvec_rad is None else np.diff(keys.rotvec_rad, axis=0)
     if keys.rotvec_rad is not None and _common_axis(keys.rotvec_rad) is not None:
         return written
     size = np.linalg.norm(written, axis=1)
-    if size.max() > MOST_TURN_RAD:
+    if size.max() > MAX_ROTATION_RAD:
         key, got = int(size.argmax()) + 2, f"{np.degrees(size.max()):.0f} deg"
-        remedy = "add a key in between, or turn about one axis alone"
-        raise BadInput(f"{where}: key {key}", "turns of less than 170 deg from key to key", got, remedy)
+        remedy = "add a key in between, or rotate about one axis alone"
+        raise BadInput(f"{source}: key {key}", "rotations of less than 170 deg from key to key", got, remedy)
     return shorter
 
 
-def _turned(keys: Keyframes, turns: np.ndarray, at_s: np.ndarray) -> np.ndarray:
-    """(frame, 3, 3) turns at ``at_s``: of the angle where all are about one axis, else of quaternions."""
-    axis = _common_axis(turns)
+def _interpolated_rotations(keys: Keyframes, rotations: np.ndarray, at_s: np.ndarray) -> np.ndarray:
+    """(frame, 3, 3) rotations at ``at_s``; the angle is interpolated if there is a single axis, else quaternions."""
+    axis = _common_axis(rotations)
     if axis is not None:
-        angle = smooth(keys.time_s, np.append(0.0, np.cumsum(turns @ axis)), at_s)
+        angle = smooth(keys.time_s, np.append(0.0, np.cumsum(rotations @ axis)), at_s)
         return Rotation.from_rotvec(angle[:, None] * axis).as_matrix() @ keys.rotmats[0]
     quaternions = Rotation.from_matrix(keys.rotmats).as_quat()
+    # A quaternion and its negative are the same rotation; successive ones get the same sign.
     flips = np.cumprod(np.concatenate(([1.0], np.where((quaternions[1:] * quaternions[:-1]).sum(1) < 0, -1.0, 1.0))))
     return Rotation.from_quat(smooth(keys.time_s, quaternions * flips[:, None], at_s)).as_matrix()
 
 
 def _common_axis(rotvec_rad: np.ndarray) -> np.ndarray | None:
-    """(3,) the unit axis that all of (row, 3) turn about, either way; None where there is none, any for no turn."""
+    """(3,) the single axis of all axis-angles (key, 3), or None; the z axis without any rotation."""
     size = np.linalg.norm(rotvec_rad, axis=1)
     longest = rotvec_rad[size.argmax()]
     axis = longest / size.max() if size.max() > SAME_AXIS_RAD else np.array([0.0, 0.0, 1.0])
@@ -141,62 +151,63 @@ def _common_axis(rotvec_rad: np.ndarray) -> np.ndarray | None:
     return axis if np.abs(across).max() < SAME_AXIS_RAD else None
 
 
-def _csv_rows(text: str, where: str) -> list[dict[str, object]]:
+def _csv_rows(text: str, source: str) -> list[dict[str, object]]:
     table = [row for row in csv.reader(io.StringIO(text)) if row and not row[0].lstrip().startswith("#")]
     names = [name.strip() for name in table[0]] if table else []
     if len(set(names)) < len(names):
-        raise BadInput(where, "a header with each column once", ", ".join(names)[:200], "correct the header")
+        raise BadInput(source, "a header with each column once", ", ".join(names)[:200], "correct the header")
     for number, row in enumerate(table[1:], 1):
         if len(row) != len(names):
-            raise BadInput(f"{where}: key {number}", f"{len(names)} numbers", f"{len(row)}", "correct the row")
+            raise BadInput(f"{source}: key {number}", f"{len(names)} numbers", f"{len(row)}", "correct the row")
     return [dict(zip(names, row, strict=True)) for row in table[1:]]
 
 
-def _json_rows(text: str, where: str) -> list[dict[str, object]]:
-    found = json.loads(text)
-    rows = found.get("keyframes") if isinstance(found, dict) else found
+def _json_rows(text: str, source: str) -> list[dict[str, object]]:
+    content = json.loads(text)
+    rows = content.get("keyframes") if isinstance(content, dict) else content
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise BadInput(where, 'a list of objects, or {"keyframes": [...]}', text[:80], "see the README")
+        raise BadInput(source, 'a list of objects, or {"keyframes": [...]}', text[:80], "see the README")
     first = rows[0].keys() if rows else ()
     if any(row.keys() != first for row in rows):
-        raise BadInput(where, "the same names in every keyframe", "some that differ", "write all of them in each")
+        raise BadInput(source, "the same names in every keyframe", "other names", "write all names in each keyframe")
     return rows
 
 
-def _columns(rows: Sequence[Mapping[str, object]], where: str) -> dict[str, np.ndarray]:
-    """(key,) numbers by name without unit: metres, radians, seconds."""
+def _columns(rows: Sequence[Mapping[str, object]], source: str) -> dict[str, np.ndarray]:
+    """Values (key,) by column name without unit, in metres, radians and seconds."""
     columns = {}
-    for written in rows[0]:
-        if written not in _COLUMNS:
-            raise BadInput(where, f"columns named {', '.join(_COLUMNS)}", str(written)[:40], _better_name(str(written)))
-        name, factor = _COLUMNS[written]
+    for header in rows[0]:
+        if header not in _COLUMNS:
+            raise BadInput(source, f"columns named {', '.join(_COLUMNS)}", str(header)[:40], _better_name(str(header)))
+        name, factor = _COLUMNS[header]
         if name in columns:
-            raise BadInput(where, f"{name} in one unit", f"{written} beside another", "leave one of them out")
+            raise BadInput(source, f"{name} in one unit", f"{header} and another unit", "remove one of the columns")
         columns[name] = np.array(
-            [_number(row[written], f"{where}: key {k}: {written}") for k, row in enumerate(rows, 1)]
+            [_number(row[header], f"{source}: key {k}: {header}") for k, row in enumerate(rows, 1)]
         )
-        _check_radians(written, columns[name], where)
+        _check_radians(header, columns[name], source)
         columns[name] *= factor
     return columns
 
 
-def _check_radians(written: str, values: np.ndarray, where: str) -> None:
-    """Raise BadInput for an angle in radians that only one in degrees can be meant by."""
-    if written.endswith("_rad") and np.abs(values).max() > 2 * np.pi + SAME_AXIS_RAD:
+def _check_radians(header: str, values: np.ndarray, source: str) -> None:
+    """Raise BadInput for an angle in radians that is probably in degrees."""
+    if header.endswith("_rad") and np.abs(values).max() > 2 * np.pi + SAME_AXIS_RAD:
         key = int(np.abs(values).argmax())
-        remedy = f"call it {written.replace('_rad', '_deg')}, if these are degrees"
-        raise BadInput(f"{where}: key {key + 1}: {written}", "at most one turn, 6.283 rad", f"{values[key]:g}", remedy)
+        remedy = f"call it {header.replace('_rad', '_deg')}, if these are degrees"
+        raise BadInput(f"{source}: key {key + 1}: {header}", "at most one turn, 6.283 rad", f"{values[key]:g}", remedy)
 
 
 def _better_name(name: str) -> str:
     lower = name.lower()
     if lower in ("time", "t", *_UNITS):
-        return f"write the unit in the name: {', '.join(c for c, (own, _) in _COLUMNS.items() if own[:1] == lower[:1])}"
-    near = difflib.get_close_matches(lower, _COLUMNS, 1, 0.5)
-    return f"did you mean {near[0]}?" if near else "correct the name, or leave the column out"
+        with_unit = [column for column, (name, _) in _COLUMNS.items() if name[:1] == lower[:1]]
+        return f"write the unit in the name: {', '.join(with_unit)}"
+    matches = difflib.get_close_matches(lower, _COLUMNS, 1, 0.5)
+    return f"did you mean {matches[0]}?" if matches else "correct the name, or remove the column"
 
 
-def _number(value: object, where: str) -> float:
+def _number(value: object, source: str) -> float:
     try:
         if isinstance(value, bool) or not isinstance(value, str | int | float):
             raise ValueError
@@ -204,45 +215,45 @@ def _number(value: object, where: str) -> float:
         if not abs(number) < 1e6:
             raise ValueError
     except (ValueError, OverflowError) as error:
-        raise BadInput(where, "a number below a million", str(value)[:40], "correct it") from error
+        raise BadInput(source, "a number below a million", str(value)[:40], "correct it") from error
     return number
 
 
-def _keyframes(columns: dict[str, np.ndarray], count: int, where: str) -> Keyframes:
+def _keyframes(columns: dict[str, np.ndarray], count: int, source: str) -> Keyframes:
     if "time" not in columns:
-        raise BadInput(where, "a column time_s", ", ".join(columns), "add the time of every key")
+        raise BadInput(source, "a column time_s", ", ".join(columns), "add the time of every key")
     zero = np.zeros(count)
     time_s = columns["time"] - columns["time"][0]
     if (np.diff(time_s) < 1e-3).any():
-        row = int((np.diff(time_s) < 1e-3).argmax()) + 2
-        raise BadInput(
-            f"{where}: key {row}", "a time after the key before", f"{columns['time'][row - 1]:g} s", "sort them"
-        )
-    if time_s[-1] > MOST_S:
+        key = int((np.diff(time_s) < 1e-3).argmax()) + 2
+        got = f"{columns['time'][key - 1]:g} s"
+        raise BadInput(f"{source}: key {key}", "a time after the key before", got, "sort the keyframes by time")
+    if time_s[-1] > MAX_S:
         remedy = "they look like milliseconds: call the column time_ms" if time_s[-1] > 1000 else "shorten it"
-        raise BadInput(f"{where}: time_s", f"at most {MOST_S:g} s", f"{time_s[-1]:g} s", remedy)
+        raise BadInput(f"{source}: time_s", f"at most {MAX_S:g} s", f"{time_s[-1]:g} s", remedy)
     shift = np.stack([columns.get(name, zero) for name in "xyz"], axis=1)
     if np.abs(shift).max() > 5:
         got = f"{np.abs(shift).max():g} m"
-        raise BadInput(where, "places within 5 m", got, "write the unit the numbers have: x_cm or x_mm")
-    turn = _written_turns(columns, count, where)
-    if isinstance(turn, Rotation):
-        return Keyframes(time_s, shift, turn.as_matrix(), columns.get("hinge"))
-    return Keyframes(time_s, shift, Rotation.from_rotvec(turn).as_matrix(), columns.get("hinge"), turn)
+        raise BadInput(source, "positions within 5 m", got, "write the unit of the numbers: x_cm or x_mm")
+    rotation = _rotation_columns(columns, count, source)
+    if isinstance(rotation, Rotation):
+        return Keyframes(time_s, shift, rotation.as_matrix(), columns.get("hinge"))
+    rotmats = Rotation.from_rotvec(rotation).as_matrix()
+    return Keyframes(time_s, shift, rotmats, hinge_rad=columns.get("hinge"), rotvec_rad=rotation)
 
 
-def _written_turns(columns: dict[str, np.ndarray], count: int, where: str) -> np.ndarray | Rotation:
-    """(key, 3) axis-angles as they are written, radians, or the rotations that quaternions are."""
-    zero, quaternion, turn = np.zeros(count), ("qx", "qy", "qz", "qw"), ("rx", "ry", "rz")
-    given = [name for name in quaternion if name in columns]
-    if not given:
-        return np.stack([columns.get(name, zero) for name in turn], axis=1)
-    if len(given) < 4 or any(name in columns for name in turn):
-        raise BadInput(where, "qw, qx, qy and qz, or rx, ry and rz", ", ".join(columns), "write one of the two, whole")
+def _rotation_columns(columns: dict[str, np.ndarray], count: int, source: str) -> np.ndarray | Rotation:
+    """Axis-angles (key, 3) in radians without reduction to half a turn, or the rotations of quaternion columns."""
+    zero, quaternion, axis_angle = np.zeros(count), ("qx", "qy", "qz", "qw"), ("rx", "ry", "rz")
+    present = [name for name in quaternion if name in columns]
+    if not present:
+        return np.stack([columns.get(name, zero) for name in axis_angle], axis=1)
+    if len(present) < 4 or any(name in columns for name in axis_angle):
+        raise BadInput(source, "qw, qx, qy and qz, or rx, ry and rz", ", ".join(columns), "write one of the two, whole")
     values = np.stack([columns[name] for name in quaternion], axis=1)
     length = np.linalg.norm(values, axis=1)
     if np.abs(length - 1).max() > 0.01:
-        row = int(np.abs(length - 1).argmax())
-        got = f"one of length {length[row]:.3g} in key {row + 1}"
-        raise BadInput(where, "quaternions of length 1", got, "write w, x, y, z of a rotation")
+        key = int(np.abs(length - 1).argmax())
+        got = f"one of length {length[key]:.3g} in key {key + 1}"
+        raise BadInput(source, "quaternions of length 1", got, "write w, x, y, z of a rotation")
     return Rotation.from_quat(values)

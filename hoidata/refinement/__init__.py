@@ -1,4 +1,4 @@
-"""Hands from generated keypoints, fitted and refined against the object; generated hands that hold what they touch."""
+"""Fitting of hands to generated keypoints, refinement against the object, and contact refinement of grasps."""
 
 from hoidata.refinement.fitting import GeneratedHand, fit_hands
 from hoidata.refinement.holding import HoldSettings, carried_share, hold_clip, hold_hands

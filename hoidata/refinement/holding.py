@@ -1,10 +1,9 @@
-"""Generated hands that hold what they touch: still on the part while they hold it, on its surface, out of it, and able
-to carry it.
+"""Contact refinement of generated grasps: hands do not slide on the object, touch its surface and can carry it.
 
-A hand is looked at in the frame of the part it touches most, where a hand that holds on is one pose. That pose, and
-corrections of the frames around it, are found by ``hold_solver``; where the hands that come out cannot carry an object
-that is in the air, they are corrected again, with fingers drawn in from farther away; and where that does not help
-either, they take it otherwise (``regrasping``).
+Each hand is refined in the frame of the part that it touches most, in which a grasp is a constant pose.
+``grasp_solver`` finds this pose and a smooth correction of the frames around it. If the hands cannot carry an object
+in the air, skin is attracted from farther away in further attempts. If that fails, alternative grasps are sampled and
+the closest stable one is used (``regrasping``).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,12 +23,12 @@ from hoidata.objects.surface_index import surface_index
 from hoidata.physics.capsules import CapsuleContacts, Capsules, joined
 from hoidata.physics.realism import StandardUnits
 from hoidata.physics.scene import Scene, capsules_there, object_scene
-from hoidata.refinement.hold_solver import Draw, HandInTime, SolverSettings
+from hoidata.refinement.grasp_solver import Attraction, HandMotion, SolverSettings
 from hoidata.refinement.kernels import N_UNKNOWNS
 from hoidata.refinement.object_field import ObjectField, world_from_part
 from hoidata.refinement.regrasping import Held, RegraspSettings, bends_rad, grasps_that_carry
 from hoidata.refinement.resting import RestSettings, rest_object
-from hoidata.refinement.skin import HandPose, Skin
+from hoidata.refinement.skin import HandPose, SkinnedHand
 from hoidata.workers import one_thread
 
 _OPPOSITE: Mapping[Side, Side] = {"left": "right", "right": "left"}
@@ -42,59 +41,55 @@ _UNDER_M = 0.005  # so much lower than the table, or than before, a hand with an
 
 @dataclass(frozen=True)
 class HoldSettings:
-    """near_m: a hand touches whose skin is nearer. still_m_s, carried_m_s: a touching hand slower than this on the part
-    holds it, where the part is at rest, and where it moves by more than moving_m_s. least: frames of a hold. gap:
-    frames between two holds that belong to one, if the hand is nearer than same_m, a hand's breadth, to where it was on
-    the part. blend: in which a hand comes to its hold, and leaves it. carry: frames by which a hold is drawn out where
-    the part moves in no hand. reach_m, keypoint_m: from where skin is drawn to the surface, and the standard deviation
-    of a vertex from where it was: the first of each, then the next, on top of what came out, where those hands cannot
-    carry the object in some of air_frames frames in which it is in the air. solver: the other wishes. regrasp: of hands
-    that cannot carry it then. rest: of the object, before all that. Raises BadInput where there is no reach, or
-    not one deviation for each.
+    """Contact refinement: what counts as a grasp, and how it is corrected.
+
+    Raises BadInput if reach_m and keypoint_m differ in length or are empty.
     """
 
-    near_m: float = 0.006
-    still_m_s: float = 0.02
-    carried_m_s: float = 0.3
-    moving_m_s: float = 0.02
-    least: int = 6
-    gap: int = 12
-    same_m: float = 0.08
-    blend: int = 8
-    carry: int = 4
-    reach_m: tuple[float, ...] = (0.003, 0.012, 0.03, 0.06)
-    keypoint_m: tuple[float, ...] = (0.006, 0.012, 0.02, 0.04)
-    air_frames: int = 4
+    near_m: float = 0.006  # a hand touches if its skin is closer than this
+    still_m_s: float = 0.02  # a touching hand slower than this on a part at rest grasps it
+    carried_m_s: float = 0.3  # the same on a moving part
+    moving_m_s: float = 0.02  # a part faster than this moves
+    least: int = 6  # frames of a grasp
+    gap: int = 12  # two grasps with at most so many frames between them are one
+    same_m: float = 0.08  # if the hand moved less than this on the part between them
+    blend: int = 8  # frames in which a hand comes to its grasp, and leaves it
+    carry: int = 4  # frames by which a grasp is extended if the part moves in no hand
+    reach_m: tuple[float, ...] = (0.003, 0.012, 0.03, 0.06)  # per attempt, as in Attraction
+    keypoint_m: tuple[float, ...] = (0.006, 0.012, 0.02, 0.04)  # per attempt, as in Attraction
+    air_frames: int = (
+        4  # frames with the object in the air in which the hands must carry it, or there is another attempt
+    )
     solver: SolverSettings = field(default_factory=SolverSettings)
-    regrasp: RegraspSettings = field(default_factory=RegraspSettings)
-    rest: RestSettings = field(default_factory=RestSettings)
+    regrasp: RegraspSettings = field(default_factory=RegraspSettings)  # after the last attempt
+    rest: RestSettings = field(default_factory=RestSettings)  # before the first attempt
 
     def __post_init__(self) -> None:
         if len(self.reach_m) != len(self.keypoint_m) or not self.reach_m:
             got = f"{len(self.reach_m)} and {len(self.keypoint_m)}"
             raise BadInput(
-                "hold: reach_m, keypoint_m", "as many of each, one at least", got, "give one of each per try"
+                "hold: reach_m, keypoint_m", "as many of each, one at least", got, "give one of each per attempt"
             )
 
 
 @one_thread()
 def hold_clip(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> Clip:
-    """The clip with its object at rest where it lay (``resting``), and hands that hold it (``hold_hands``)."""
+    """Snap a resting object to its first height (``resting``), then refine the hands (``hold_hands``)."""
     clip = rest_object(clip, settings.rest)
     return replace(clip, hands=hold_hands(pair, clip, settings))
 
 
 @one_thread()
 def carried_share(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> float:
-    """Share of some frames in the air in which the hands of a clip can carry its object; 1 where it never is there."""
+    """Fraction of some frames with the object in the air in which the hands can carry it; 1 without such frames."""
     return _Load.of(clip, settings.air_frames).carried_share(pair, clip.hands)
 
 
 @one_thread()
 def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> dict[Side, HandTrack]:
-    """The hands of a clip, still, touching and outside while they hold; one that never does stays as it was.
+    """Refine the hands of a clip; hands without a grasp and invalid frames are unchanged.
 
-    A frame in which a hand is not valid is not changed. Without known gravity, or an inside, nothing has to be carried.
+    An object without known gravity or without an inside counts as carried.
     """
     load, best, most = _Load.of(clip, settings.air_frames), dict(clip.hands), -1.0
     parts: dict[Side, int] = {}  # what each hand holds at first: to the next try it may seem to hold the other one
@@ -105,7 +100,7 @@ def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings
             break
         for side, start in starts.items():
             parts.setdefault(side, start.part)
-        tracks = _solved(pair, clip, starts, settings.solver, Draw(reach, keypoint))
+        tracks = _solved(pair, clip, starts, settings.solver, Attraction(reach, keypoint))
         share = load.carried_share(pair, tracks)
         # A try that carries no more than the best so far is no answer, but the next one goes on from it.
         if share > most:
@@ -148,7 +143,7 @@ def _starts(pair: HandPair, clip: Clip, settings: HoldSettings, parts: Mapping[S
 
 
 def _solved(
-    pair: HandPair, clip: Clip, starts: Mapping[Side, "_Start"], wishes: SolverSettings, draw: Draw
+    pair: HandPair, clip: Clip, starts: Mapping[Side, "_Start"], wishes: SolverSettings, draw: Attraction
 ) -> dict[Side, HandTrack]:
     """All hands of a clip, those that hold something corrected one after the other."""
     tracks = dict(clip.hands)
@@ -236,7 +231,7 @@ class _Start:
     """
 
     track: HandTrack
-    skin: Skin
+    skin: SkinnedHand
     pose: HandPose
     holds: list[Interval]
     part_from_world: RigidTransform
@@ -244,11 +239,11 @@ class _Start:
     part: int
     passed: np.ndarray | None
 
-    def solved(self, other: Capsules | None, settings: SolverSettings, draw: Draw) -> HandTrack:
+    def solved(self, other: Capsules | None, settings: SolverSettings, draw: Attraction) -> HandTrack:
         """The corrected hand; frames without it stay as they were. other: capsules of the other, world frame."""
         other = None if other is None else other.seen_from(self.part_from_world)
         valid, held = self.track.valid, (self.part, self.passed)
-        hand = HandInTime(self.skin, self.field, self.pose, self.holds, valid, other, settings, draw, *held)
+        hand = HandMotion(self.skin, self.field, self.pose, self.holds, valid, other, settings, draw, *held)
         pose = hand.corrected()
         track = self.track
         made = pose.seen_from(self.part_from_world.inverse()).track(track.mean_betas, track.valid, track.template_m)
@@ -265,7 +260,7 @@ class _Grip:
     """
 
     track: HandTrack
-    skin: Skin
+    skin: SkinnedHand
     part: int
     pose: HandPose
     holds: list[Interval]
@@ -360,7 +355,7 @@ class _Grip:
         part_from_world = self.world_from_part.inverse()[middle]
         some = np.arange(0, N_VERTICES, _SOME_SKIN)
         return Held(
-            Skin(hand, np.asarray(self.track.betas, np.float64)[0], self.track.template_m, some),
+            SkinnedHand(hand, np.asarray(self.track.betas, np.float64)[0], self.track.template_m, some),
             ObjectField(_in_part(load.clip.object, self.object_from_part)),
             self.part,
             passed,
@@ -397,7 +392,7 @@ def _grip(pair: HandPair, side: Side, clip: Clip, settings: HoldSettings, part: 
     track, thing = clip.hands[side], clip.object
     if not track.valid.any():
         return None
-    skin = Skin(pair[side], np.asarray(track.betas, np.float64)[0], track.template_m)
+    skin = SkinnedHand(pair[side], np.asarray(track.betas, np.float64)[0], track.template_m)
     world = HandPose.of(track)
     points_m = skin.vertices_m(skin.chain(world))
     field = ObjectField(thing)

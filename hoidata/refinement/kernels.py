@@ -1,8 +1,9 @@
-"""Derivatives of skinned vertices, and distances with their slope: the loops of the refinement, compiled.
+"""Compiled loops of the refinement: derivatives of skinned vertices, distances with their gradients.
 
-The unknowns of one hand in one frame are 51: the wrist's place 3, a small turn of the whole hand about it 3 (world
-axes, applied from the left), and the axis-angles of the 15 finger joints 45. float64, one thread. All that call each
-other stand in this file: numba keeps compiled code by the file it is in, and does not see a change in another.
+The unknowns of one hand in one frame are 51: wrist position 3, a small rotation of the hand about the wrist 3 (world
+axes, applied from the left), axis-angles of the 15 finger joints 45. Everything is float64 on one thread.
+
+Functions that call each other are in this file: numba caches compiled code per file and misses changes in another file.
 """
 
 import numpy as np
@@ -13,12 +14,12 @@ _PARENT = np.array((-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14))
 
 
 @njit(cache=True)
-def place_joints(turns, bone, rotation, position):  # pragma: no cover (compiled)
-    """Set ``rotation (frame, 16, 3, 3)`` and ``position (frame, 16, 3)`` of all joints after the wrist, which are set.
+def place_joints(local_rotmats, bone, rotation, position):  # pragma: no cover (compiled)
+    """Set ``rotation (frame, 16, 3, 3)`` and ``position (frame, 16, 3)`` of the finger joints; the wrist's are given.
 
-    turns: (frame, 15, 3, 3) local rotations. bone: (15, 3) from each joint's parent to it, at rest.
+    local_rotmats: (frame, 15, 3, 3) relative to the parent. bone: (15, 3) from each joint's parent to it, at rest.
     """
-    for f in range(len(turns)):
+    for f in range(len(local_rotmats)):
         for j in range(1, 16):
             p = _PARENT[j]
             for a in range(3):
@@ -28,33 +29,33 @@ def place_joints(turns, bone, rotation, position):  # pragma: no cover (compiled
                 for c in range(3):
                     total = 0.0
                     for b in range(3):
-                        total += rotation[f, p, a, b] * turns[f, j - 1, b, c]
+                        total += rotation[f, p, a, b] * local_rotmats[f, j - 1, b, c]
                     rotation[f, j, a, c] = total
 
 
 @njit(cache=True)
-def skin_vertices(weight, rest_joint, rotation, position, rested, out):  # pragma: no cover (compiled)
-    """Set ``out (frame, vertex, 3)`` to where joints put vertices ``rested (frame, vertex, 3)``.
+def skin_vertices(weight, rest_joint, rotation, position, rest, out):  # pragma: no cover (compiled)
+    """Linear blend skinning: set ``out (frame, vertex, 3)`` from vertices ``rest (frame, vertex, 3)`` at rest.
 
     weight: (vertex, 16). rest_joint: (16, 3). rotation, position: of the joints, (frame, 16, 3, 3) and (frame, 16, 3).
     """
     shift = np.empty((16, 3))
-    for f in range(len(rested)):
+    for f in range(len(rest)):
         for j in range(16):
             for a in range(3):
                 shift[j, a] = position[f, j, a]
                 for b in range(3):
                     shift[j, a] -= rotation[f, j, a, b] * rest_joint[j, b]
         for v in range(len(weight)):
-            x, y, z = rested[f, v, 0], rested[f, v, 1], rested[f, v, 2]
+            x, y, z = rest[f, v, 0], rest[f, v, 1], rest[f, v, 2]
             to_x, to_y, to_z = 0.0, 0.0, 0.0
             for j in range(16):
                 w = weight[v, j]
                 if w != 0.0:
-                    turn = rotation[f, j]
-                    to_x += w * (turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z + shift[j, 0])
-                    to_y += w * (turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z + shift[j, 1])
-                    to_z += w * (turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z + shift[j, 2])
+                    r = rotation[f, j]
+                    to_x += w * (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + shift[j, 0])
+                    to_y += w * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + shift[j, 1])
+                    to_z += w * (r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + shift[j, 2])
             out[f, v, 0], out[f, v, 1], out[f, v, 2] = to_x, to_y, to_z
 
 
@@ -62,39 +63,41 @@ def skin_vertices(weight, rest_joint, rotation, position, rested, out):  # pragm
 def vertex_derivatives(frame, vertex, skin, chain, out):  # pragma: no cover (compiled)
     """Set ``out (pair, 3, 51)`` to the derivatives of the vertices ``vertex (pair,)`` in the frames ``frame (pair,)``.
 
-    skin: weights (vertex, 16), rest joints (16, 3), pose directions (vertex, 3, 135), whether a vertex feels a joint's
-    pose (vertex, 16). chain: world rotations (frame, 16, 3, 3) and positions (frame, 16, 3) of the joints, world axes
-    (frame, 16, 3, 3) of their unknowns in columns, derivatives (frame, 15, 9, 3) of the local rotations, and the
-    vertices (frame, vertex, 3) at rest.
+    skin: weights (vertex, 16), rest joints (16, 3), pose directions (vertex, 3, 135), whether a joint's pose corrective
+    moves a vertex (vertex, 16). chain: the fields of ``skin.Chain``.
     """
-    weight, rest_joint, pose_direction, feels = skin
-    rotation, position, axis, local, rested = chain
-    moment, share, blend = np.empty((16, 3)), np.empty(16), np.empty((3, 3))
+    weight, rest_joint, pose_direction, has_corrective = skin
+    rotation, position, axis, local, rest = chain
+    moment, subtree_weight, blend = np.empty((16, 3)), np.empty(16), np.empty((3, 3))
     for pair in range(len(frame)):
         f, v = frame[pair], vertex[pair]
-        _gather(weight[v], rest_joint, rotation[f], position[f], rested[f, v], moment, share, blend)
+        _gather(weight[v], rest_joint, rotation[f], position[f], rest[f, v], moment, subtree_weight, blend)
         out[pair] = 0.0
         for a in range(3):
             out[pair, a, a] = 1.0
         for j in range(16):
-            if share[j] != 0.0:
-                x = moment[j, 0] - share[j] * position[f, j, 0]
-                y = moment[j, 1] - share[j] * position[f, j, 1]
-                z = moment[j, 2] - share[j] * position[f, j, 2]
+            if subtree_weight[j] != 0.0:
+                # A joint moves its subtree as a rigid body: the derivative is axis x (weighted lever).
+                x = moment[j, 0] - subtree_weight[j] * position[f, j, 0]
+                y = moment[j, 1] - subtree_weight[j] * position[f, j, 1]
+                z = moment[j, 2] - subtree_weight[j] * position[f, j, 2]
                 for c in range(3):
-                    along, up, ahead = axis[f, j, 0, c], axis[f, j, 1, c], axis[f, j, 2, c]
-                    out[pair, 0, 3 + 3 * j + c] = up * z - ahead * y
-                    out[pair, 1, 3 + 3 * j + c] = ahead * x - along * z
-                    out[pair, 2, 3 + 3 * j + c] = along * y - up * x
-            if feels[v, j]:
+                    ax, ay, az = axis[f, j, 0, c], axis[f, j, 1, c], axis[f, j, 2, c]
+                    out[pair, 0, 3 + 3 * j + c] = ay * z - az * y
+                    out[pair, 1, 3 + 3 * j + c] = az * x - ax * z
+                    out[pair, 2, 3 + 3 * j + c] = ax * y - ay * x
+            if has_corrective[v, j]:
                 _add_bend(pose_direction[v, :, 9 * j - 9 : 9 * j], local[f, j - 1], blend, 3 + 3 * j, out[pair])
 
 
 @njit(cache=True)
-def _gather(weight, rest_joint, rotation, position, rested, moment, share, blend):  # pragma: no cover (compiled)
-    """Of one vertex: the weight of each joint and all beyond it (share), the sum of weight times the place they put the
-    vertex at (moment), and the blended rotation (blend)."""
-    moment[:], share[:], blend[:] = 0.0, weight, 0.0
+def _gather(weight, rest_joint, rotation, position, rest, moment, subtree_weight, blend):  # pragma: no cover (compiled)
+    """Set sums over joints for one vertex.
+
+    subtree_weight: (16,) weight of each joint and its descendants. moment: (16, 3) the same sum of weight times the
+    position each joint gives the vertex. blend: (3, 3) blended rotation.
+    """
+    moment[:], subtree_weight[:], blend[:] = 0.0, weight, 0.0
     for j in range(16):
         w = weight[j]
         if w == 0.0:
@@ -102,67 +105,67 @@ def _gather(weight, rest_joint, rotation, position, rested, moment, share, blend
         for a in range(3):
             total = position[j, a]
             for b in range(3):
-                total += rotation[j, a, b] * (rested[b] - rest_joint[j, b])
+                total += rotation[j, a, b] * (rest[b] - rest_joint[j, b])
                 blend[a, b] += w * rotation[j, a, b]
             moment[j, a] = w * total
     for j in range(15, 0, -1):
-        share[_PARENT[j]] += share[j]
+        subtree_weight[_PARENT[j]] += subtree_weight[j]
         moment[_PARENT[j]] += moment[j]
 
 
 @njit(cache=True)
 def _add_bend(direction, local, blend, column, out):  # pragma: no cover (compiled)
-    """Add how one joint's pose corrective moves the vertex: direction (3, 9), local (9, 3), out (3, 51)."""
+    """Add the derivative of one joint's pose corrective: direction (3, 9), local (9, 3), out (3, 51)."""
     for c in range(3):
         for a in range(3):
-            rest = 0.0
+            rest_change = 0.0
             for e in range(9):
-                rest += direction[a, e] * local[e, c]
+                rest_change += direction[a, e] * local[e, c]
             for b in range(3):
-                out[b, column + c] += blend[b, a] * rest
+                out[b, column + c] += blend[b, a] * rest_change
 
 
 @njit(cache=True)
-def add_squares(frame, slope, derivative, weight, miss, matrix, vector):  # pragma: no cover (compiled)
-    """Add ``weight (pair,)`` times the square of residuals ``miss (pair,)`` to the normal equations of their frames.
+def add_squares(frame, slope, derivative, weight, residual, matrix, vector):  # pragma: no cover (compiled)
+    """Add weighted squares of residuals to the normal equations of their frames; weight and residual: (pair,).
 
     The derivative of a residual is ``slope (pair, 3) @ derivative (pair, 3, 51)``. matrix: (frame, 51, 51), lower
     triangle; vector: (frame, 51), minus half the gradient.
     """
-    row = np.empty(N_UNKNOWNS)
+    gradient = np.empty(N_UNKNOWNS)
     for pair in range(len(frame)):
         f = frame[pair]
         for i in range(N_UNKNOWNS):
-            row[i] = 0.0
+            gradient[i] = 0.0
             for a in range(3):
-                row[i] += slope[pair, a] * derivative[pair, a, i]
+                gradient[i] += slope[pair, a] * derivative[pair, a, i]
         for i in range(N_UNKNOWNS):
-            if row[i] != 0.0:
-                scaled = weight[pair] * row[i]
-                vector[f, i] -= scaled * miss[pair]
+            if gradient[i] != 0.0:
+                scaled = weight[pair] * gradient[i]
+                vector[f, i] -= scaled * residual[pair]
                 for j in range(i + 1):
-                    matrix[f, i, j] += scaled * row[j]
+                    matrix[f, i, j] += scaled * gradient[j]
 
 
 @njit(cache=True)
-def lower_signed(low_m, cell_m, value, rotation, offset, places_m, distance_m, slope):  # pragma: no cover (compiled)
-    """Where the surface of a grid is nearer than ``distance_m (frame, place)``, set it and its ``slope`` (..., 3).
+def lower_signed(low_m, cell_m, value, rotation, offset, points_m, distance_m, slope):  # pragma: no cover (compiled)
+    """Minimum of distances and the signed distances of a grid: update ``distance_m (frame, point)`` and ``slope``.
 
-    value: (z, y, x) signed distances, node (0, 0, 0) at low_m (3,), cell_m apart. rotation, offset: part-from-world of
-    each frame. places_m: (frame, place, 3), world; the slope is turned to the world too. Off the grid the way to it is
-    added to the value at its rim.
+    value: (z, y, x) signed distances, node (0, 0, 0) at low_m (3,), cell_m apart, interpolated trilinearly. rotation,
+    offset: part-from-world of each frame. points_m: (frame, point, 3) world. slope: (frame, point, 3) gradient, world.
+    Outside of the grid the distance to the grid is added to the value at its boundary.
     """
     last_x, last_y, last_z = value.shape[2] - 1, value.shape[1] - 1, value.shape[0] - 1
-    for f in range(places_m.shape[0]):
-        turn, shift = rotation[f], offset[f]
-        for p in range(places_m.shape[1]):
-            wx, wy, wz = places_m[f, p, 0], places_m[f, p, 1], places_m[f, p, 2]
-            far_u = (turn[0, 0] * wx + turn[0, 1] * wy + turn[0, 2] * wz + shift[0] - low_m[0]) / cell_m
-            far_v = (turn[1, 0] * wx + turn[1, 1] * wy + turn[1, 2] * wz + shift[1] - low_m[1]) / cell_m
-            far_w = (turn[2, 0] * wx + turn[2, 1] * wy + turn[2, 2] * wz + shift[2] - low_m[2]) / cell_m
-            u, v, w = min(max(far_u, 0.0), last_x), min(max(far_v, 0.0), last_y), min(max(far_w, 0.0), last_z)
-            way_u, way_v, way_w = far_u - u, far_v - v, far_w - w
-            way = np.sqrt(way_u * way_u + way_v * way_v + way_w * way_w)
+    for f in range(points_m.shape[0]):
+        r, shift = rotation[f], offset[f]
+        for p in range(points_m.shape[1]):
+            wx, wy, wz = points_m[f, p, 0], points_m[f, p, 1], points_m[f, p, 2]
+            grid_u = (r[0, 0] * wx + r[0, 1] * wy + r[0, 2] * wz + shift[0] - low_m[0]) / cell_m
+            grid_v = (r[1, 0] * wx + r[1, 1] * wy + r[1, 2] * wz + shift[1] - low_m[1]) / cell_m
+            grid_w = (r[2, 0] * wx + r[2, 1] * wy + r[2, 2] * wz + shift[2] - low_m[2]) / cell_m
+            u, v, w = min(max(grid_u, 0.0), last_x), min(max(grid_v, 0.0), last_y), min(max(grid_w, 0.0), last_z)
+            out_u, out_v, out_w = grid_u - u, grid_v - v, grid_w - w  # from the grid's boundary, in cells
+            outside = np.sqrt(out_u * out_u + out_v * out_v + out_w * out_w)
             i, j, k = min(int(u), last_x - 1), min(int(v), last_y - 1), min(int(w), last_z - 1)
             u, v, w = u - i, v - j, w - k
             a, b = value[k, j, i], value[k, j, i + 1]
@@ -172,34 +175,34 @@ def lower_signed(low_m, cell_m, value, rotation, offset, places_m, distance_m, s
             below, above = a + u * (b - a), c + u * (d - c)
             below_up, above_up = e + u * (g - e), h + u * (m - h)
             near, near_up = below + v * (above - below), below_up + v * (above_up - below_up)
-            found = near + w * (near_up - near) + way * cell_m
-            if not found < distance_m[f, p]:
+            signed_m = near + w * (near_up - near) + outside * cell_m
+            if not signed_m < distance_m[f, p]:
                 continue
-            distance_m[f, p] = found
+            distance_m[f, p] = signed_m
             first, second = (b - a) + v * ((d - c) - (b - a)), (g - e) + v * ((m - h) - (g - e))
-            su = (first + w * (second - first)) / cell_m if way_u == 0.0 else way_u / way
+            su = (first + w * (second - first)) / cell_m if out_u == 0.0 else out_u / outside
             sv = ((above - below) + w * ((above_up - below_up) - (above - below))) / cell_m
-            sv = sv if way_v == 0.0 else way_v / way
-            sw = (near_up - near) / cell_m if way_w == 0.0 else way_w / way
+            sv = sv if out_v == 0.0 else out_v / outside
+            sw = (near_up - near) / cell_m if out_w == 0.0 else out_w / outside
             for axis in range(3):
-                slope[f, p, axis] = turn[0, axis] * su + turn[1, axis] * sv + turn[2, axis] * sw
+                slope[f, p, axis] = r[0, axis] * su + r[1, axis] * sv + r[2, axis] * sw
 
 
 @njit(cache=True)
-def lower_capsules(start_m, end_m, radius_m, places_m, distance_m, slope):  # pragma: no cover (compiled)
-    """Where a capsule is nearer than ``distance_m (frame, place)``, set it and its ``slope (frame, place, 3)``.
+def lower_capsules(start_m, end_m, radius_m, points_m, distance_m, slope):  # pragma: no cover (compiled)
+    """Minimum of distances and the signed distances to capsules: update ``distance_m (frame, point)`` and ``slope``.
 
-    start_m, end_m: (frame, capsule, 3) ends of the axes; radius_m: (capsule,). NaN: not there. Capsules more than
-    0.3 m from the first place of a frame are not looked at.
+    start_m, end_m: (frame, capsule, 3) ends of the axes, NaN for an absent capsule. radius_m: (capsule,). slope:
+    (frame, point, 3) gradient. Capsules more than 0.3 m from the first point of a frame are skipped.
     """
-    for f in range(places_m.shape[0]):
+    for f in range(points_m.shape[0]):
         for c in range(len(radius_m)):
             start, axis = start_m[f, c], end_m[f, c] - start_m[f, c]
-            if not ((start - places_m[f, 0]) ** 2).sum() < 0.09:
+            if not ((start - points_m[f, 0]) ** 2).sum() < 0.09:
                 continue
             square = max((axis**2).sum(), 1e-12)
-            for p in range(places_m.shape[1]):
-                x, y, z = (places_m[f, p, 0] - start[0], places_m[f, p, 1] - start[1], places_m[f, p, 2] - start[2])
+            for p in range(points_m.shape[1]):
+                x, y, z = (points_m[f, p, 0] - start[0], points_m[f, p, 1] - start[1], points_m[f, p, 2] - start[2])
                 along = min(max((x * axis[0] + y * axis[1] + z * axis[2]) / square, 0.0), 1.0)
                 x, y, z = x - along * axis[0], y - along * axis[1], z - along * axis[2]
                 away = np.sqrt(x * x + y * y + z * z)

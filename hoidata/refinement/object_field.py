@@ -1,4 +1,4 @@
-"""Distances to an object from grids of its parts at rest: made once, asked at every frame and hinge angle."""
+"""Signed distances to a moving object, from one distance grid per part at rest."""
 
 from collections.abc import Sequence
 
@@ -10,78 +10,85 @@ from hoidata.objects.distance_grid import DistanceGrid
 from hoidata.objects.surface_index import surface_index
 from hoidata.refinement.kernels import lower_signed
 
-# A grid of distances, and the rotation and translation of every frame.
+# The distance grid of a part, and rotation and translation of part-from-world in every frame.
 _Part = tuple[DistanceGrid, tuple[np.ndarray, np.ndarray]]
 
 
 class ObjectField:
-    """The surface of one moving object. A part that bounds no solid has no inside: its distances are not negative."""
+    """The surface of a moving object. A part that bounds no solid has no inside: its distances are not negative."""
 
-    def __init__(self, thing: ObjectTrack) -> None:
-        surfaces = surface_index(thing.model).filled
-        self._parts: list[_Part] = [  # one grid per part, whatever the frames and angles
-            (surface.grid, _contiguous(world_from_part(thing, part).inverse())) for part, surface in surfaces.items()
+    def __init__(self, track: ObjectTrack) -> None:
+        surfaces = surface_index(track.model).filled
+        self._parts: list[_Part] = [
+            (surface.grid, _contiguous(world_from_part(track, part).inverse())) for part, surface in surfaces.items()
         ]
 
     @property
     def moves(self) -> bool:
-        """The object has a part that a hinge moves."""
+        """Whether the object is articulated."""
         return len(self._parts) > 1
 
     def most_depth_m(self, part: int) -> float:
-        """How deep inside of one part a place can lie; 0 where it has no inside."""
+        """Largest depth inside of a part; 0 for a part without an inside."""
         return max(0.0, -float(self._parts[part][0].value.min()))
 
-    def nearest_part(self, places_m: np.ndarray) -> np.ndarray:
-        """(frame, place) number of the part whose surface is nearest to places (frame, place, 3), world."""
-        each = []
-        for grid, (rotation, offset) in self._parts:
-            each.append(np.full(places_m.shape[:2], np.inf))
-            lower_signed(*grid, rotation, offset, np.ascontiguousarray(places_m), each[-1], np.zeros(places_m.shape))
-        return np.argmin(each, axis=0)
+    def nearest_part(self, points_m: np.ndarray) -> np.ndarray:
+        """(frame, point) index of the part with the smallest distance to points (frame, point, 3), world."""
+        return np.argmin([self.distances_to(part, points_m)[0] for part in range(len(self._parts))], axis=0)
 
     def part_touched(
-        self, places_m: np.ndarray, touching: np.ndarray, part: int | None = None
+        self, points_m: np.ndarray, touching: np.ndarray, part: int | None = None
     ) -> tuple[int, np.ndarray]:
-        """Number of the part that most places (frame, place, 3), world, touch, or ``part``; and (frame, place) which
-        touch that one.
+        """The part that most points touch, and which points touch it.
 
-        touching: (frame, place) bool, which touch any part.
+        Args:
+            points_m: (frame, point, 3) world.
+            touching: (frame, point) bool, whether a point touches the object.
+            part: count the points of this part instead of the most touched one.
+
+        Returns:
+            Index of the part, and (frame, point) bool, whether a point touches it.
         """
         if not self.moves:
             return 0, touching
-        nearest = self.nearest_part(places_m)
-        each = [touching & (nearest == number) for number in (0, 1)]
+        nearest = self.nearest_part(points_m)
+        by_part = [touching & (nearest == number) for number in (0, 1)]
         if part is None:
-            part = int(each[1].sum() > each[0].sum())
-        return part, each[part]
+            part = int(by_part[1].sum() > by_part[0].sum())
+        return part, by_part[part]
 
-    def distances(self, places_m: np.ndarray, frames: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Signed distances (frame, place), metres, and their slope (frame, place, 3), world frame.
+    def distances(self, points_m: np.ndarray, frames: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Signed distance to the object, the smaller one of two parts.
 
-        places_m: (frame, place, 3) world. frames: (frame,) which of the object's, all by default. Of two parts the one
-        whose distance is less.
+        Args:
+            points_m: (frame, point, 3) world.
+            frames: (frame,) index of each frame in the object's motion, all frames by default.
+
+        Returns:
+            Distances (frame, point), metres, and their gradients (frame, point, 3), world.
         """
-        return self._lowest(self._parts, places_m, frames)
+        return self._lowest(self._parts, points_m, frames)
 
-    def distances_to(self, part: int, places_m: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As ``distances``, to one part alone."""
-        return self._lowest(self._parts[part : part + 1], places_m, frames)
+    def distances_to(
+        self, part: int, points_m: np.ndarray, frames: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As ``distances``, to one part."""
+        return self._lowest(self._parts[part : part + 1], points_m, frames)
 
     @staticmethod
     def _lowest(
-        parts: Sequence[_Part], places_m: np.ndarray, frames: np.ndarray | None
+        parts: Sequence[_Part], points_m: np.ndarray, frames: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        rows = slice(None) if frames is None else frames
-        distance, slope = np.full(places_m.shape[:2], np.inf), np.zeros(places_m.shape)
+        chosen = slice(None) if frames is None else frames
+        distance, slope = np.full(points_m.shape[:2], np.inf), np.zeros(points_m.shape)
         for grid, (rotation, offset) in parts:
-            lower_signed(*grid, rotation[rows], offset[rows], np.ascontiguousarray(places_m), distance, slope)
+            lower_signed(*grid, rotation[chosen], offset[chosen], np.ascontiguousarray(points_m), distance, slope)
         return distance, slope
 
 
-def world_from_part(thing: ObjectTrack, part: int) -> RigidTransform:
-    """(frame,) the motion of one part of an object."""
-    return thing.world_from_object @ thing.model.object_from_part(part, thing.hinge_rad)
+def world_from_part(track: ObjectTrack, part: int) -> RigidTransform:
+    """(frame,) pose of one part of a moving object."""
+    return track.world_from_object @ track.model.object_from_part(part, track.hinge_rad)
 
 
 def _contiguous(transform: RigidTransform) -> tuple[np.ndarray, np.ndarray]:

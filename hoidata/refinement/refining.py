@@ -1,9 +1,8 @@
-"""Hands refined as one motion: held to what was generated, touching where it says so, out of the object, and smooth.
+"""Refine hands over a whole motion: near the generated keypoints, in contact, outside of the object, and smooth.
 
-BimArt (CVPR 2025) Sec. 3.4 has the last three terms (Eq. 10-12) and stays near its start only by stopping early. Here a
-Levenberg-Marquardt solver converges, so a data term holds the hands to the generated motion. Residuals are in units of
-the standard deviations of :class:`RefinementSettings`; time grows linearly with the length of the motion, and does not
-depend on the object's mesh.
+BimArt (CVPR 2025) Sec. 3.4 has the last three terms (Eq. 10-12) and stays near its start by early stopping. This
+Levenberg-Marquardt solver converges, so it has a data term for the generated keypoints. Residuals are in the standard
+deviations of :class:`RefinementSettings`. Time is linear in the frames and does not depend on the object's mesh.
 """
 
 from collections.abc import Mapping
@@ -14,36 +13,29 @@ import numpy as np
 from hoidata.clips.clip import HandTrack, ObjectTrack
 from hoidata.errors import BadInput
 from hoidata.hands.model import HandModel, HandPair, Side
-from hoidata.refinement.banded import acceleration_equations, second_differences, solve_damped
+from hoidata.refinement.banded import acceleration_equations, minimize_banded, second_differences
 from hoidata.refinement.fitting import GeneratedHand, check_generated, pose_prior
 from hoidata.refinement.kernels import N_UNKNOWNS, add_squares
 from hoidata.refinement.object_field import ObjectField
-from hoidata.refinement.skin import HandPose, Skin
+from hoidata.refinement.skin import HandPose, SkinnedHand
 from hoidata.workers import one_thread
 
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """Standard deviations, metres; a smaller one counts more.
+    """Standard deviations of the residuals (a smaller one counts more) and stopping criteria."""
 
-    keypoint_m: of a keypoint from the generated one, touching_m where the hand is to touch the object; one that is
-    outlier_m off counts half. surface_m: of keypoint plus generated vector from the object's surface; off by more than
-    stray_m, the vector is not believed. reach_m: vectors of this length count 0.6 of short ones. depth_m: of a vertex
-    inside the object. acceleration_m: of a keypoint's second difference in time, per frame squared. pose: weight of the
-    prior of finger poses. steps: at most; fewer where one gains less than ``enough`` of the cost.
-    """
-
-    keypoint_m: float = 0.004
-    touching_m: float = 0.006
-    outlier_m: float = 0.02
-    surface_m: float = 0.0015
-    stray_m: float = 0.01
-    reach_m: float = 0.02
-    depth_m: float = 0.0003
-    acceleration_m: float = 0.003
-    pose: float = 1.0
-    steps: int = 15
-    enough: float = 1e-4
+    keypoint_m: float = 0.004  # of a keypoint from the generated one
+    touching_m: float = 0.006  # the same in frames in which the hand should touch the object
+    outlier_m: float = 0.02  # a keypoint error of this size counts half (Cauchy loss)
+    surface_m: float = 0.0015  # distance of keypoint plus generated vector from the object's surface
+    stray_m: float = 0.01  # a generated vector that ends farther from the surface hardly counts (Geman-McClure loss)
+    reach_m: float = 0.02  # a generated vector of this length counts 0.6 of a short one (Gaussian weight)
+    depth_m: float = 0.0003  # of a vertex inside the object
+    acceleration_m: float = 0.003  # second difference of a keypoint in time, metres per frame squared
+    pose: float = 1.0  # weight of the prior of finger poses
+    steps: int = 15  # largest number of steps
+    enough: float = 1e-4  # stop when a step reduces the cost by less than this fraction
 
 
 @one_thread()
@@ -52,41 +44,50 @@ def refine_hands(
     keypoint_ids: np.ndarray,
     generated: Mapping[Side, GeneratedHand],
     tracks: Mapping[Side, HandTrack],
-    thing: ObjectTrack,
+    object_track: ObjectTrack,
     settings: RefinementSettings = RefinementSettings(),
 ) -> dict[Side, HandTrack]:
-    """Refined hands, each side as one motion of any length; shapes stay as they are.
+    """Refine fitted hands against the object; shapes are unchanged.
 
-    generated, keypoint_ids: as in ``fit_hands``. tracks: the start, as it gives them. thing: the object's motion, as
-    many frames. Raises BadInput for arrays that do not fit each other.
+    Args:
+        pair: hand models of both sides.
+        keypoint_ids: as in ``fit_hands``.
+        generated: as in ``fit_hands``.
+        tracks: the start, as returned by ``fit_hands``.
+        object_track: the object's motion, with equally many frames.
+        settings: standard deviations and stopping criteria.
+
+    Raises:
+        BadInput: arrays of inconsistent shapes or lengths.
     """
-    field = ObjectField(thing)
+    field = ObjectField(object_track)
     refined = {}
     for side, hand in generated.items():
         check_generated(side, hand, keypoint_ids)
-        if not len(hand.keypoints_m) == thing.n_frames == tracks[side].n_frames:
-            got = f"{len(hand.keypoints_m)}, {tracks[side].n_frames} and {thing.n_frames} frames"
+        if not len(hand.keypoints_m) == object_track.n_frames == tracks[side].n_frames:
+            got = f"{len(hand.keypoints_m)}, {tracks[side].n_frames} and {object_track.n_frames} frames"
             raise BadInput(f"refinement of the {side} hand", "equally many frames", got, "check the caller")
-        refined[side] = _Motion(pair[side], keypoint_ids, hand, tracks[side], field, settings).refined()
+        refiner = _HandRefiner(pair[side], keypoint_ids, hand, tracks[side], field=field, settings=settings)
+        refined[side] = refiner.refined()
     return refined
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """A pose and all that its cost is made of. chain: of the keypoints."""
+class _EvaluatedMotion:
+    """A hand's motion with the residuals of its cost. near frame: a frame in which the hand is active."""
 
     pose: HandPose
-    points_m: np.ndarray
-    surface_m: np.ndarray
-    surface_slope: np.ndarray
-    depth_m: np.ndarray
-    depth_slope: np.ndarray
-    difference: np.ndarray
+    points_m: np.ndarray  # (frame, keypoint, 3)
+    surface_m: np.ndarray  # (near frame, keypoint) signed distance of keypoint plus generated vector
+    surface_slope: np.ndarray  # (near frame, keypoint, 3) its gradient
+    depth_m: np.ndarray  # (near frame, vertex) signed distance of vertices inside the object, else 0
+    depth_slope: np.ndarray  # (near frame, vertex, 3) its gradient
+    difference: np.ndarray  # (frame, keypoint x 3) second difference in time
     cost: float
 
 
-class _Motion:
-    """One hand over all frames."""
+class _HandRefiner:
+    """Cost and normal equations of one hand over all frames."""
 
     def __init__(
         self,
@@ -99,89 +100,96 @@ class _Motion:
     ) -> None:
         self.track, self.field, self.settings = track, field, settings
         betas = np.asarray(track.betas, np.float64)[0]
-        self.skin, self.all = Skin(model, betas, track.template_m, ids), Skin(model, betas, track.template_m)
+        self.keypoints = SkinnedHand(model, betas, track.template_m, ids)
+        self.vertices = SkinnedHand(model, betas, track.template_m)
         self.mean, self.precision = pose_prior(model)
-        self.there = hand.is_there
-        self.target_m = np.where(self.there[:, None, None], hand.keypoints_m, 0.0)
-        self.near = np.flatnonzero(hand.is_active & self.there)
+        is_present = hand.is_present
+        self.target_m = np.where(is_present[:, None, None], hand.keypoints_m, 0.0)
+        self.near = np.flatnonzero(hand.is_active & is_present)
         self.to_object_m = hand.to_object_m[self.near]
-        trust = np.exp(-0.5 * (self.to_object_m**2).sum(-1) / settings.reach_m**2)
-        trust = np.nan_to_num(trust)
-        self.trust = trust / settings.surface_m**2
-        squares = np.full(len(self.there), settings.keypoint_m**2)
-        squares[self.near] += (settings.touching_m**2 - settings.keypoint_m**2) * trust.max(axis=1)
-        self.held = self.there / squares
+        touch = np.nan_to_num(np.exp(-0.5 * (self.to_object_m**2).sum(-1) / settings.reach_m**2))
         self.to_object_m = np.nan_to_num(self.to_object_m)
-        self.tied = np.zeros(len(self.there))
-        self.tied[2:] = (self.there[2:] & self.there[1:-1] & self.there[:-2]) / settings.acceleration_m**2
+        self.surface_weight = touch / settings.surface_m**2
+        # A hand that should touch may leave its generated keypoints more.
+        variance = np.full(len(is_present), settings.keypoint_m**2)
+        variance[self.near] += (settings.touching_m**2 - settings.keypoint_m**2) * touch.max(axis=1)
+        self.keypoint_weight = is_present / variance
+        self.acceleration_weight = np.zeros(len(is_present))
+        three_frames = is_present[2:] & is_present[1:-1] & is_present[:-2]
+        self.acceleration_weight[2:] = three_frames / settings.acceleration_m**2
 
     def refined(self) -> HandTrack:
-        seen, damping = self._see(HandPose.of(self.track)), 1e-3
-        for _ in range(self.settings.steps):
-            blocks, vector = self._equations(seen)
-            while True:
-                moved = self._see(seen.pose.moved(solve_damped(blocks, vector, damping)))
-                if moved.cost < seen.cost or damping > 1e4:
-                    break
-                damping *= 10
-            if not moved.cost < seen.cost:  # also where it is no finite number
-                break
-            gain, seen, damping = 1 - moved.cost / seen.cost, moved, damping / 10
-            if gain < self.settings.enough:
-                break
-        return seen.pose.track(self.track.mean_betas, self.track.valid, self.track.template_m)
+        """The track at the minimum of the cost."""
+        motion = minimize_banded(
+            self._evaluate(HandPose.of(self.track)),
+            lambda motion: motion.cost,
+            self._equations,
+            lambda motion, step: self._evaluate(motion.pose.moved(step)),
+            max_steps=self.settings.steps,
+            min_gain=self.settings.enough,
+        )
+        return motion.pose.track(self.track.mean_betas, self.track.valid, self.track.template_m)
 
-    def _see(self, pose: HandPose) -> _Seen:
-        near_pose = HandPose(*(array[self.near] for array in pose))
-        points = self.skin.vertices_m(self.skin.chain(pose))
+    def _evaluate(self, pose: HandPose) -> _EvaluatedMotion:
+        points = self.keypoints.vertices_m(self.keypoints.chain(pose))
         surface, surface_slope = self.field.distances(points[self.near] + self.to_object_m, self.near)
-        vertices = self.all.vertices_m(self.all.chain(near_pose))
-        distance, slope = self.field.distances(vertices, self.near)
+        vertices = self.vertices.vertices_m(self.vertices.chain(pose.taken(self.near)))
+        distance, depth_slope = self.field.distances(vertices, self.near)
         difference = second_differences(points.reshape(len(points), -1))
         depth = np.minimum(distance, 0.0)
-        cost = self._cost(pose, points, surface, depth, difference)
-        return _Seen(pose, points, surface, surface_slope, depth, slope, difference, cost)
+        return _EvaluatedMotion(
+            pose,
+            points_m=points,
+            surface_m=surface,
+            surface_slope=surface_slope,
+            depth_m=depth,
+            depth_slope=depth_slope,
+            difference=difference,
+            cost=self._cost(pose, points, surface, depth, difference),
+        )
 
     def _cost(
         self, pose: HandPose, points: np.ndarray, surface: np.ndarray, depth: np.ndarray, difference: np.ndarray
     ) -> float:
-        """Robust: Cauchy's for keypoints, Geman and McClure's for the surface."""
-        own, off = self.settings, pose.fingers.reshape(-1, 45) - self.mean
-        miss = ((points - self.target_m) ** 2).sum(-1)
-        total = own.outlier_m**2 * (self.held * np.log1p(miss / own.outlier_m**2).sum(axis=1)).sum()
-        total += (self.trust * surface**2 / (1 + (surface / own.stray_m) ** 2)).sum()
-        total += (depth**2).sum() / own.depth_m**2 + (self.tied * (difference**2).sum(1)).sum()
-        return float(total + own.pose * ((off @ self.precision) * off).sum())
+        """Cauchy loss for keypoints, Geman-McClure loss for the surface, squares for the rest."""
+        settings, deviation = self.settings, pose.fingers.reshape(-1, 45) - self.mean
+        squared_error = ((points - self.target_m) ** 2).sum(-1)
+        log_error = np.log1p(squared_error / settings.outlier_m**2).sum(axis=1)
+        total = settings.outlier_m**2 * (self.keypoint_weight * log_error).sum()
+        total += (self.surface_weight * surface**2 / (1 + (surface / settings.stray_m) ** 2)).sum()
+        total += (depth**2).sum() / settings.depth_m**2 + (self.acceleration_weight * (difference**2).sum(1)).sum()
+        return float(total + settings.pose * ((deviation @ self.precision) * deviation).sum())
 
-    def _equations(self, seen: _Seen) -> tuple[list[np.ndarray], np.ndarray]:
+    def _equations(self, motion: _EvaluatedMotion) -> tuple[list[np.ndarray], np.ndarray]:
         """Blocks and minus half the gradient, as ``solve_blocks`` takes them."""
-        own, chain = self.settings, self.skin.chain(seen.pose, slopes=True)
-        derivative = self.skin.all_derivatives(chain)
-        blocks, vector = acceleration_equations(derivative, seen.difference, self.tied)
-        miss = seen.points_m - self.target_m
-        robust = self.held[:, None] / (1 + (miss**2).sum(-1) / own.outlier_m**2)
-        weight = robust[..., None, None] * np.eye(3)
-        pull = robust[..., None] * miss
-        believed = self.trust / (1 + (seen.surface_m / own.stray_m) ** 2) ** 2
-        slope = seen.surface_slope
-        weight[self.near] += believed[..., None, None] * slope[..., :, None] * slope[..., None, :]
-        pull[self.near] += (believed * seen.surface_m)[..., None] * slope
-        by_point = derivative.reshape(*miss.shape, N_UNKNOWNS)
+        settings, chain = self.settings, self.keypoints.chain(motion.pose, slopes=True)
+        derivative = self.keypoints.all_derivatives(chain)
+        blocks, vector = acceleration_equations(derivative, motion.difference, self.acceleration_weight)
+        # Iteratively reweighted least squares: the weights are the losses' derivatives by the squared residual.
+        error = motion.points_m - self.target_m
+        cauchy = self.keypoint_weight[:, None] / (1 + (error**2).sum(-1) / settings.outlier_m**2)
+        weight = cauchy[..., None, None] * np.eye(3)
+        gradient = cauchy[..., None] * error
+        geman = self.surface_weight / (1 + (motion.surface_m / settings.stray_m) ** 2) ** 2
+        slope = motion.surface_slope
+        weight[self.near] += geman[..., None, None] * slope[..., :, None] * slope[..., None, :]
+        gradient[self.near] += (geman * motion.surface_m)[..., None] * slope
+        by_point = derivative.reshape(*error.shape, N_UNKNOWNS)
         weighted = (weight @ by_point).reshape(derivative.shape)
         blocks[0] += derivative.swapaxes(1, 2) @ weighted
-        vector -= (derivative.swapaxes(1, 2) @ pull.reshape(len(pull), -1, 1))[..., 0]
-        blocks[0][:, 6:, 6:] += own.pose * self.precision
-        vector[:, 6:] += own.pose * (self.mean - seen.pose.fingers.reshape(-1, 45)) @ self.precision
-        self._add_depth(seen, blocks[0], vector)
+        vector -= (derivative.swapaxes(1, 2) @ gradient.reshape(len(gradient), -1, 1))[..., 0]
+        blocks[0][:, 6:, 6:] += settings.pose * self.precision
+        vector[:, 6:] += settings.pose * (self.mean - motion.pose.fingers.reshape(-1, 45)) @ self.precision
+        self._add_depth(motion, blocks[0], vector)
         return blocks, vector
 
-    def _add_depth(self, seen: _Seen, matrix: np.ndarray, vector: np.ndarray) -> None:
-        """Only vertices that are inside, in frames where the hand is near."""
-        row, vertex = np.nonzero(seen.depth_m < 0)
-        if not len(row):
+    def _add_depth(self, motion: _EvaluatedMotion, matrix: np.ndarray, vector: np.ndarray) -> None:
+        """Add the residuals of vertices inside the object."""
+        frame, vertex = np.nonzero(motion.depth_m < 0)
+        if not len(frame):
             return
-        near_pose = HandPose(*(array[self.near] for array in seen.pose))
-        derivative = self.all.derivatives(self.all.chain(near_pose, slopes=True), row, vertex)
-        weight = np.full(len(row), self.settings.depth_m**-2.0)
-        slope, depth = seen.depth_slope[row, vertex], seen.depth_m[row, vertex]
-        add_squares(self.near[row], slope, derivative, weight, depth, matrix, vector)
+        chain = self.vertices.chain(motion.pose.taken(self.near), slopes=True)
+        derivative = self.vertices.derivatives(chain, frame, vertex)
+        weight = np.full(len(frame), self.settings.depth_m**-2.0)
+        slope, depth = motion.depth_slope[frame, vertex], motion.depth_m[frame, vertex]
+        add_squares(self.near[frame], slope, derivative, weight, depth, matrix, vector)

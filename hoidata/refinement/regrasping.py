@@ -1,8 +1,7 @@
-"""Another grasp for a hand that cannot carry: of many near its own, closed on the object, the nearest that can.
+"""Alternative grasp search for a hand that cannot carry the object: the closest of many sampled grasps that can.
 
-Where a network does not know an object, hands lie flat on one side of it: all of their skin touches, and nothing
-opposes it, however far fingers are drawn. Some of many hands nearby, turned, opened and closed again, take it from two
-sides.
+A network that has not seen an object often generates hands flat on one side of it. No attraction of fingers gives such
+a grasp opposing contacts. The search samples hands nearby, rotated and opened, and closes them on the object.
 """
 
 from collections.abc import Callable, Iterator
@@ -13,9 +12,9 @@ import numpy as np
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands.model import JOINT_NAMES
 from hoidata.physics.capsules import Capsules
-from hoidata.refinement.hold_solver import Draw, SolverSettings, Wishes, settled
+from hoidata.refinement.grasp_solver import Attraction, GraspObjective, SolverSettings, solve_each_frame
 from hoidata.refinement.object_field import ObjectField
-from hoidata.refinement.skin import HandPose, Skin
+from hoidata.refinement.skin import HandPose, SkinnedHand
 from hoidata.settings import at_least
 
 _OPPOSED = [JOINT_NAMES.index(name) for name in ("index3", "middle3", "thumb3")]
@@ -25,28 +24,21 @@ _AT_ONCE = 32  # hands; bounds memory, changes nothing
 
 @dataclass(frozen=True)
 class RegraspSettings:
-    """tries: hands; 0 keeps the grasps that were generated. answers: how many that carry are taken up at most, until
-    one still does with the hand's way to it. turn_rad, shift_m: standard deviations, of a hand's turn about its middle
-    and of where it goes; most_m: by which it is moved towards the object's centre at most. closing: how it is drawn to
-    the object in the search, in so many steps; holding: how with its way. bent_rad: no finger joint may be turned by
-    more, if it was not before. deep_m, way_deep_m: no skin may lie deeper, in the hold and on the way. step_m: no wrist
-    may go farther from one frame to the next, if it did not before. blend: frames in which a hand comes to another
-    grasp, and leaves it.
-    """
+    """Alternative grasp search: how grasps are sampled, closed and accepted."""
 
-    tries: int = 192
-    answers: int = 8
-    turn_rad: float = 0.45
-    shift_m: float = 0.02
-    most_m: float = 0.1
-    closing: Draw = field(default_factory=lambda: Draw(0.06, 0.04))
-    steps: int = 8
-    holding: Draw = field(default_factory=lambda: Draw(0.012, 0.006))
-    bent_rad: float = 1.9
-    deep_m: float = 0.006
-    way_deep_m: float = 0.008
-    step_m: float = 0.04
-    blend: int = 16
+    tries: int = 192  # sampled hands; 0 disables the search
+    answers: int = 8  # carrying grasps that are tried in the whole motion
+    turn_rad: float = 0.45  # standard deviation of the rotation about the hand's centre
+    shift_m: float = 0.02  # standard deviation of the translation
+    most_m: float = 0.1  # largest translation towards the object's centre
+    closing: Attraction = field(default_factory=lambda: Attraction(0.06, 0.04))  # of a sampled hand
+    steps: int = 8  # solver steps of a sampled hand
+    holding: Attraction = field(default_factory=lambda: Attraction(0.012, 0.006))  # of the whole motion
+    bent_rad: float = 1.9  # largest rotation of a finger joint, unless the original is larger
+    deep_m: float = 0.006  # largest depth of skin in a grasp
+    way_deep_m: float = 0.008  # largest depth of skin in the whole motion, unless the original is larger
+    step_m: float = 0.04  # largest wrist motion per frame, unless the original is larger
+    blend: int = 16  # frames in which a hand comes to another grasp, and leaves it
 
     def __post_init__(self) -> None:
         at_least("hold.regrasp", self, "tries", 0)
@@ -60,7 +52,7 @@ class Held:
     centre_m: (3,) the object's centre of mass. other: capsules of the other hand in that frame.
     """
 
-    skin: Skin
+    skin: SkinnedHand
     field: ObjectField
     part: int
     passed: bool
@@ -104,8 +96,10 @@ def _closed(held: Held, hands: HandPose, solver: SolverSettings, settings: Regra
     other = None if held.other is None else held.other.taken(np.zeros_like(frames))
     there = np.ones(len(frames), bool)
     passed = there if held.passed else None
-    wishes = Wishes(held.skin, held.field, hands, frames, there, other, solver, settings.closing, held.part, passed)
-    return settled(wishes, settings.steps)
+    wishes = GraspObjective(
+        held.skin, held.field, hands, frames, there, other, solver, settings.closing, held.part, passed
+    )
+    return solve_each_frame(wishes, settings.steps)
 
 
 def _hands_near(held: Held, settings: RegraspSettings) -> HandPose:

@@ -1,8 +1,8 @@
-"""An object not yet taken, or put down where it lay, lies as high as at first, and does not pass through the table.
+"""Snap a resting object to its first height, and keep it above the table.
 
-Generated objects come back some millimetres too high or too low, or pass through the table on the way. All that is in
-the frame is moved up or down together, so nothing changes between hands and object. An object that ends elsewhere, and
-on its way is far below where it lay, was put down on something lower.
+Generated objects are put down some millimetres too high or too low, or pass through the table. Hands and object are
+raised or lowered together, so that their relative pose is unchanged. An object that ends elsewhere and was far below
+its first height was put down on something lower.
 """
 
 from dataclasses import dataclass, replace
@@ -17,24 +17,19 @@ _ENOUGH = 500  # vertices tell whether a rigid body moves
 
 @dataclass(frozen=True)
 class RestSettings:
-    """still_m_s, drift_m: an object that is slower at the clip's ends, and as high within this, is at rest.
-    level_m: nearer than this to its first height it is meant to lie where it lay; farther, it was put down elsewhere,
-    and if it was ever that far below, it stays there. fade: frames in which an object that was raised before it was
-    taken, and is put down elsewhere, comes back to its own height. through_m: an object that goes lower than this
-    below its first height, and ends at it, was held there at both ends and stays as it was.
-    """
+    """What counts as at rest, and which heights are corrected."""
 
-    still_m_s: float = 0.03
-    drift_m: float = 0.01
-    level_m: float = 0.03
-    fade: int = 11
-    through_m: float = 0.08
+    still_m_s: float = 0.03  # an object slower than this at an end of the clip is at rest
+    drift_m: float = 0.01  # if its height changes by less than this
+    level_m: float = 0.03  # an end closer than this to the first height is at that height; farther, it is elsewhere
+    fade: int = 11  # frames over which the correction of the start fades if the object is put down elsewhere
+    through_m: float = 0.08  # an object that goes lower than this below both ends was held at both ends; unchanged
 
 
 def rest_object(clip: Clip, settings: RestSettings = RestSettings()) -> Clip:
-    """The clip with every frame raised or lowered, so that the object rests at the height it started from.
+    """Raise or lower each frame of a clip, so that the object rests at the height it started from.
 
-    A clip whose gravity is not known, or that starts with an object in motion, stays as it was.
+    A clip without known gravity, or with an object in motion at the start, is unchanged.
     """
     if clip.gravity is None or clip.n_frames < 3:
         return clip

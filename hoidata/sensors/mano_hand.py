@@ -1,4 +1,4 @@
-"""A MANO-layout hand to sense with: 16 joints, 5 tips, 19 capsules, and 104 points of its palm side."""
+"""MANO-layout hand as a ``TrackedHand``: 16 joints, 5 tips, 19 capsules, 104 proximity sensors on the palm side."""
 
 from functools import lru_cache
 
@@ -16,24 +16,28 @@ from hoidata.physics.mano_capsules import fit_capsules
 N_SENSORS = 104
 _INDEX, _MIDDLE, _PINKY, _THUMB = 1, 4, 7, 13
 _MIDDLE_TIP_BONE = 5
-# How straight a vertex must look out of the palm (cosine); the thumb's pad looks to the fingers, and is rounder.
+# Least cosine of a sensor's normal with the palm direction. The pad of the thumb faces the fingers and is rounder.
 _FACING, _THUMB_FACING = 0.8, 0.6
-_WRIST_ENDS_AT = 0.4  # of the way from the wrist to the middle knuckle: skin nearer to the wrist touches little
+# Fraction of the distance from wrist to middle knuckle. Skin closer to the wrist rarely touches objects.
+_WRIST_FRACTION = 0.4
 
 
 def mano_hand(
     hands: HandPair, side: Side, betas: np.ndarray | None = None, template_m: np.ndarray | None = None
 ) -> TrackedHand:
-    """One side of a hand of shape ``betas (10,)``; template_m (778, 3) replaces the model's rest mesh.
+    """A MANO-layout hand of one shape; its joints, tips and skin equal those of ``hoidata.hands.track_vertices``.
 
-    Pose blend shapes are those of the model: joints, tips and skin are those of ``hoidata.hands.track_vertices``.
+    Args:
+        hands: models of both sides.
+        side: which side.
+        betas: (10,) shape coefficients, zeros by default.
+        template_m: (778, 3) personal rest mesh instead of the model's template.
     """
     model, betas = hands[side], np.zeros(10) if betas is None else np.asarray(betas, dtype=np.float64)
     template = model.template_m if template_m is None else np.asarray(template_m, dtype=np.float64)
     joints = model.rest_joints_m(betas, template_m)
     vertices = template + model.shape_directions @ betas
     points = [*TIP_VERTICES, *sensor_vertices(hands.right)]
-    fitted = fit_capsules(model, betas, template_m)
     parents = np.array(PARENTS)
     return TrackedHand(
         side=side,
@@ -43,14 +47,14 @@ def mano_hand(
         offset_m=np.concatenate([np.zeros((1, 3)), joints[1:] - joints[parents[1:]]]),
         rest_rotmats=rotvec_to_rotmat(model.mean_pose.reshape(-1, 3)),
         skin=Skin(
-            vertices[points],
-            vertex_normals(vertices, model.faces)[points],
-            model.skin_weights[points],
-            RigidTransform(np.tile(np.eye(3), (N_ROTATIONS, 1, 1)), -joints),
-            model.pose_directions[points],
+            point_m=vertices[points],
+            normal=vertex_normals(vertices, model.faces)[points],
+            weight=model.skin_weights[points],
+            joint_from_skin=RigidTransform(np.tile(np.eye(3), (N_ROTATIONS, 1, 1)), -joints),
+            corrective_m=model.pose_directions[points],
         ),
         tip_joint=np.array([3, 6, 9, 12, 15]),
-        capsules=JointCapsules(*fitted),
+        capsules=JointCapsules(*fit_capsules(model, betas, template_m)),
         middle_knuckle=_MIDDLE,
         wrist_from_canonical=canonical_axes(model),
         hinge_axis=np.zeros((N_ROTATIONS, 3)),
@@ -59,7 +63,7 @@ def mano_hand(
 
 
 def canonical_axes(model: HandModel) -> np.ndarray:
-    """(3, 3) columns: to the fingers, to the thumb, out of the back, in the wrist's axes; of the flat mean hand."""
+    """(3, 3) canonical axes in columns, in the wrist's axes, from the rest joints of the mean shape."""
     joints = model.rest_joints_m(np.zeros(10))
     x = joints[_MIDDLE] - joints[0]
     x = x / np.linalg.norm(x)
@@ -72,17 +76,18 @@ def canonical_axes(model: HandModel) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def sensor_vertices(right: HandModel) -> tuple[int, ...]:
-    """104 vertices of the palm side, evenly spread, rising; the left hand's have the same numbers."""
+    """104 evenly spread vertices of the palm side, ascending; the left hand has sensors at the same vertices."""
     axes, joints = canonical_axes(right), right.rest_joints_m(np.zeros(10))
-    places, bones = (right.template_m - joints[0]) @ axes, (joints - joints[0]) @ axes
+    vertices, bones = (right.template_m - joints[0]) @ axes, (joints - joints[0]) @ axes
     normals = vertex_normals(right.template_m, right.faces) @ axes
-    owner = right.skin_weights.argmax(axis=1)
+    segment = right.skin_weights.argmax(axis=1)
     palmar = -normals[:, 2] > _FACING
     for joint in range(_THUMB, _THUMB + 3):
-        along = bones[_THUMB + 2] - bones[_THUMB]
+        # The pad faces the middle finger, across the bone of the thumb.
+        thumb = bones[_THUMB + 2] - bones[_THUMB]
         pad = bones[_MIDDLE_TIP_BONE] - bones[joint]
-        pad = pad - (pad @ along) / (along @ along) * along
-        palmar = np.where(owner == joint, normals @ pad > _THUMB_FACING * np.linalg.norm(pad), palmar)
-    candidates = np.flatnonzero(palmar & (places[:, 0] > _WRIST_ENDS_AT * bones[_MIDDLE, 0]))
-    chosen = farthest_points(places[candidates], N_SENSORS)
+        pad = pad - (pad @ thumb) / (thumb @ thumb) * thumb
+        palmar = np.where(segment == joint, normals @ pad > _THUMB_FACING * np.linalg.norm(pad), palmar)
+    candidates = np.flatnonzero(palmar & (vertices[:, 0] > _WRIST_FRACTION * bones[_MIDDLE, 0]))
+    chosen = farthest_points(vertices[candidates], N_SENSORS)
     return tuple(sorted(int(vertex) for vertex in candidates[chosen]))

@@ -96,11 +96,11 @@ class Scene:
         hinge_rad = object_features[:, OBJECT_HINGE] if model.is_articulated else np.zeros(len(object_features))
         rotation = rot6d_to_rotmat(object_features[:, OBJECT_ROTATION_6D])
         model_from_object = RigidTransform(rotation, object_features[:, OBJECT_POSITION])
-        nearest = bps.look(hinge_rad)
+        nearest = bps.nearest_points(hinge_rad)
         return cls(
             basis_offset=nearest.offset,
-            object_point_m=nearest.place_m,
-            point_exists=nearest.there,
+            object_point_m=nearest.point_m,
+            point_exists=nearest.is_present,
             object_scale=bps.scale,
             hinge_rad=hinge_rad,
             model_from_canonical=model_from_object @ object_from_canonical,

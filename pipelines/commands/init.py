@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from hoidata.beside import FOLDER
 from hoidata.errors import BadInput
+from hoidata.package_paths import FOLDER
 from pipelines.commands.project import PROFILE
 
 FILES = ("params.yaml", "prefect.toml", ".dvcignore", ".gitignore", ".dvc/config", ".dvc/.gitignore")

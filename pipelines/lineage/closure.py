@@ -14,8 +14,8 @@ from importlib.util import find_spec
 from itertools import accumulate
 from pathlib import Path
 
-from hoidata.beside import INSTALLED, home_of
 from hoidata.files.atomic import sha256_file, write_whole
+from hoidata.package_paths import INSTALLED, package_home
 
 # An import statement: the module after ``from`` or None, how many folders up, the names.
 Statement = tuple[str | None, int, list[str]]
@@ -141,7 +141,7 @@ class SourceTree:
     @cached_property
     def _homes(self) -> dict[str, Path]:
         """The folder each package lies in: the project, or where a package of others is installed."""
-        homes: dict[str, Path] = {name: home_of(name, self._root) for name in OWN_PACKAGES}
+        homes: dict[str, Path] = {name: package_home(name, self._root) for name in OWN_PACKAGES}
         for point in self._entry_points:
             top = point.module.partition(".")[0]
             spec = None if top in homes else find_spec(top)

@@ -1,4 +1,4 @@
-"""A small hand to sense with: a wrist, a thumb and four fingers of one joint, eight skin points. No licensed data."""
+"""A small tracked hand without licensed data: wrist, thumb and four fingers of one joint, eight sensors."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -10,7 +10,7 @@ SENSORS = 8
 
 
 def small_hand(seed: int = 0) -> TrackedHand:
-    """A right hand of 6 joints; fingers to +x, thumb to +y. seed: of its skin, which has no symmetry."""
+    """A right hand of 6 joints; fingers to +x, thumb to +y. seed: of the sensors."""
     random = np.random.default_rng(seed)
     offset = np.array([[0, 0, 0], [3, 3, -1], [10, 2.5, 0], [10.5, 0.5, 0.5], [10, -1.5, 0], [9, -3.5, -0.5]]) / 100
     tips = offset + np.array([0.06, 0.0, -0.005])
@@ -44,6 +44,6 @@ def small_hand(seed: int = 0) -> TrackedHand:
     )
 
 
-def turns(count: int, size_rad: float, seed: int) -> np.ndarray:
-    """(count, 3, 3) random rotations of about this angle."""
+def random_rotations(count: int, size_rad: float, seed: int) -> np.ndarray:
+    """(count, 3, 3) random rotations; ``size_rad`` is the standard deviation of each axis-angle component."""
     return Rotation.from_rotvec(np.random.default_rng(seed).normal(0, size_rad, (count, 3))).as_matrix()

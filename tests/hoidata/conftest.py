@@ -1,4 +1,4 @@
-"""A small store that has everything a store can have, for the tests of writing, reading, checking and migrating."""
+"""A small store that uses every feature of the schema, for tests of writing, reading and checking."""
 
 import shutil
 from collections.abc import Callable
@@ -15,20 +15,20 @@ from hoidata.hands import load_embedded_hands
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 
-LEFT_OUT = Quarantined("test/s9/bad_1", "bad_1.npz", "7 columns", "6", "download it again")
+LEFT_OUT = Quarantined("test/s9/bad_1", "bad_1.npz", expected="7 columns", got="6", remedy="download it again")
 
 
 @pytest.fixture(scope="session")
-def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the store that all tests copy is written once."""
-    return tmp_path_factory.mktemp("kept") / "clips"
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Path of the store that is written once and copied for each test."""
+    return tmp_path_factory.mktemp("stored") / "clips"
 
 
 @pytest.fixture
 def clips(make_clip):
-    """Rigid and articulated, invalid frames, betas per frame, a personal template, a second object, no label.
+    """Three clips: rigid and articulated objects, invalid frames, betas per frame, a personal template, no label.
 
-    Camera, body and contact labels in some; some frames without, an empty list of contacts, no expression.
+    Some have a second object, a camera, a body, contact labels or an empty list of contacts.
     """
     plain = replace(
         make_clip(seed=1, clip_id="test/s1/a", gravity=None),
@@ -70,7 +70,8 @@ def clips(make_clip):
 def camera(n_frames: int, intrinsics: np.ndarray | None = None) -> CameraTrack:
     rng = np.random.default_rng(n_frames)
     rotvec, position = rng.normal(size=(2, n_frames, 3)).astype(np.float32)
-    return CameraTrack("cam4", rotvec, position, np.arange(n_frames, dtype=np.int32) * 2, intrinsics)
+    source_frames = np.arange(n_frames, dtype=np.int32) * 2
+    return CameraTrack("cam4", rotvec, position, source_frames, intrinsics=intrinsics)
 
 
 def body(n_frames: int, expression: bool) -> BodyTrack:
@@ -92,11 +93,11 @@ def left_out() -> Quarantined:
 
 
 @pytest.fixture
-def folder(kept: Path, tmp_path: Path, request: pytest.FixtureRequest) -> Path:
-    if not kept.exists():
+def folder(stored: Path, tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    if not stored.exists():
         clips = request.getfixturevalue("clips")
-        write_store(kept, [clips[0], LEFT_OUT, *clips[1:]], generated_info("test"))
-    shutil.copytree(kept, tmp_path / "clips")
+        write_store(stored, [clips[0], LEFT_OUT, *clips[1:]], generated_info("test"))
+    shutil.copytree(stored, tmp_path / "clips")
     return tmp_path / "clips"
 
 
@@ -107,13 +108,13 @@ def hands():
 
 @pytest.fixture
 def load_clips(load_all) -> Callable:
-    """As ``load_all``, without the stretches left out."""
+    """As ``load_all``, without the quarantined intervals."""
     return lambda adapter, root: [item for item in load_all(adapter, root) if isinstance(item, Clip)]
 
 
 @pytest.fixture
 def load_all() -> Callable:
-    """All clips and left-out stretches of every sequence below a root, as the adapter gives them."""
+    """All clips and quarantined intervals of all sequences below a root, as loaded by the adapter."""
 
     def load(adapter, root: Path) -> list:
         keys = adapter.sequences(root)

@@ -1,4 +1,4 @@
-"""Work shared out on a Dask cluster: the same bytes as here, also when workers die."""
+"""Work on a Dask cluster gives the bytes of one local process, also when workers die."""
 
 import os
 import signal
@@ -18,14 +18,14 @@ from hoidata.workers import in_order, in_workers
 from tests.hoidata.conversion.killable import write_grab
 
 distributed = pytest.importorskip("distributed")
-only_in_chaos = pytest.mark.skipif("HOIDATA_CHAOS" not in os.environ, reason="`make chaos` stages it")
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # of Dask's own threads, as they end
+only_in_chaos = pytest.mark.skipif("HOIDATA_CHAOS" not in os.environ, reason="`make chaos` runs it")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # of Dask's threads when they end
 DIES = "s1/mug_lift_002"
 
 
 @dataclass(frozen=True)
 class DyingOnce(GrabAdapter):
-    """Takes its worker along the first time it is asked for one sequence; ``note`` tells that it did."""
+    """Kills its worker at the first load of one sequence, and then creates the file ``note``."""
 
     note: str = ""
 
@@ -46,7 +46,7 @@ class DyingAlways(GrabAdapter):
 
 @pytest.fixture(scope="module")
 def corpus(tmp_path_factory) -> Path:
-    """Raw files, and what one process here makes of them."""
+    """Raw files, and the store and contact that one local process makes from them."""
     folder, hands = tmp_path_factory.mktemp("corpus"), load_embedded_hands()
     write_grab(folder / "raw", hands, 9)
     convert_dataset(GrabAdapter(), folder / "raw", hands, folder / "clips", progress=False)
@@ -56,7 +56,7 @@ def corpus(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def scheduler():
-    """The address of a cluster that runs already: two workers, processes of their own."""
+    """The address of a running cluster with two worker processes."""
     import dask
 
     with (
@@ -67,7 +67,7 @@ def scheduler():
 
 
 @pytest.fixture
-def on_it(scheduler):
+def on_cluster(scheduler):
     workers.choose_workers(scheduler)
     yield
     workers.choose_workers("local")
@@ -77,15 +77,15 @@ def digests(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): sha256_file(path) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_cluster_makes_the_same_store_and_contact_as_one_process_here(corpus, hands, on_it, tmp_path, monkeypatch):
-    monkeypatch.chdir(corpus)  # relative paths are those of the one that asks
+def test_a_cluster_makes_the_store_and_contact_of_one_local_process(corpus, hands, on_cluster, tmp_path, monkeypatch):
+    monkeypatch.chdir(corpus)  # relative paths are relative to the client's folder
     convert_dataset(GrabAdapter(), "raw", hands, tmp_path / "clips", progress=False)
     assert digests(tmp_path / "clips") == digests(corpus / "clips")
     contact_store("clips", tmp_path / "contact")
     assert digests(tmp_path / "contact") == digests(corpus / "contact")
 
 
-def test_a_worker_of_the_cluster_that_is_killed_changes_no_byte(corpus, hands, on_it, tmp_path):
+def test_a_killed_cluster_worker_changes_no_byte(corpus, hands, on_cluster, tmp_path):
     adapter = DyingOnce(note=str(tmp_path / "died"))
     convert_dataset(adapter, corpus / "raw", hands, tmp_path / "clips", progress=False)
     assert (tmp_path / "died").exists()
@@ -93,22 +93,22 @@ def test_a_worker_of_the_cluster_that_is_killed_changes_no_byte(corpus, hands, o
 
 
 @only_in_chaos
-def test_a_sequence_that_ends_every_worker_is_left_out_and_the_others_are_not(corpus, hands, on_it, tmp_path):
+def test_a_sequence_that_ends_each_worker_is_quarantined_and_the_others_are_not(corpus, hands, on_cluster, tmp_path):
     summary = convert_dataset(DyingAlways(), corpus / "raw", hands, tmp_path / "clips", progress=False)
     assert summary.clips == 8
-    (left_out,) = summary.left_out
-    assert left_out.source_key == f"grab/{DIES}"
-    assert "several workers" in left_out.got
+    (quarantined,) = summary.left_out
+    assert quarantined.source_key == f"grab/{DIES}"
+    assert "several workers" in quarantined.got
 
 
-def test_nobody_else_on_this_machine_gets_into_a_cluster_started_here():
+def test_other_users_of_the_machine_cannot_connect_to_a_local_cluster():
     workers.choose_workers("dask")
     try:
         with workers._client(1) as client:
             address = client.scheduler.address
             assert client.submit(doubled, 2).result() == 4
             for theirs, at in ((None, address.replace("tls:", "tcp:")), (distributed.Security.temporary(), address)):
-                with pytest.raises(OSError):  # noqa: PT011 - of the handshake, in words of the system
+                with pytest.raises(OSError):  # noqa: PT011 - the message of the handshake depends on the system
                     distributed.Client(at, security=theirs, timeout=2, set_as_default=False)
     finally:
         workers.choose_workers("local")
@@ -120,14 +120,14 @@ def doubled(number: int) -> int:
     return 2 * number
 
 
-def test_what_the_function_raises_is_raised_here_and_results_come_in_order_when_asked(on_it):
+def test_an_exception_of_the_function_is_raised_and_in_order_sorts_results(on_cluster):
     numbers = list(range(40))
     assert list(in_order(in_workers(doubled, numbers, 1), numbers)) == [(number, 2 * number) for number in numbers]
     with pytest.raises(BadInput, match="0 or more"):
         list(in_workers(doubled, [1, -1, 2], 1))
 
 
-def test_a_cluster_without_a_worker_is_told_and_not_waited_for(monkeypatch):
+def test_a_cluster_without_a_worker_is_refused(monkeypatch):
     monkeypatch.setattr(workers, "PATIENCE_S", 1)
     with distributed.LocalCluster(n_workers=0, dashboard_address=None) as empty:
         workers.choose_workers(empty.scheduler_address)
@@ -139,7 +139,7 @@ def test_a_cluster_without_a_worker_is_told_and_not_waited_for(monkeypatch):
 
 
 @only_in_chaos
-def test_a_cluster_started_for_the_work_ends_with_it(monkeypatch):
+def test_a_cluster_started_for_a_call_ends_with_it(monkeypatch):
     workers.choose_workers("dask")
     try:
         assert not workers.is_used_for(1)
@@ -148,7 +148,7 @@ def test_a_cluster_started_for_the_work_ends_with_it(monkeypatch):
         workers.choose_workers("local")
 
 
-def test_an_address_where_nothing_runs_or_no_address_says_so(monkeypatch):
+def test_an_unreachable_or_invalid_address_is_refused(monkeypatch):
     monkeypatch.setattr(workers, "PATIENCE_S", 1)
     with pytest.raises(BadInput, match="local, dask or"):
         workers.choose_workers("ray")

@@ -1,4 +1,4 @@
-"""Processes end with the process that started them, and soon after Ctrl-C or SIGTERM, whatever code they run."""
+"""Processes end with their parent, and within seconds of Ctrl-C or SIGTERM, whatever code they run."""
 
 import os
 import signal
@@ -42,9 +42,9 @@ def is_at_work(pid: int) -> bool:
 
 
 def started(code: str, **options) -> subprocess.Popen:
-    """A Python process that has printed its first line; the test reads the words of that line from ``words``."""
+    """A Python process that has printed its first line; ``first_line`` has the words of that line."""
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, **options)
-    process.words = process.stdout.readline().split()  # pyright: ignore
+    process.first_line = process.stdout.readline().split()  # pyright: ignore
     return process
 
 
@@ -92,9 +92,9 @@ time.sleep(60)
 
 
 @pytest.mark.parametrize("how", [BY_THE_KERNEL, BY_A_THREAD, BY_NUMBER], ids=["kernel", "thread", "number"])
-def test_a_process_ends_when_the_one_that_started_it_is_killed(how: str) -> None:
+def test_a_process_ends_when_its_parent_is_killed(how: str) -> None:
     parent = started(how)
-    children = [int(word) for word in parent.words]  # pyright: ignore
+    children = [int(word) for word in parent.first_line]  # pyright: ignore
     assert children
     assert all(map(is_at_work, children))
     parent.kill()
@@ -103,7 +103,7 @@ def test_a_process_ends_when_the_one_that_started_it_is_killed(how: str) -> None
     until(lambda: not any(map(is_at_work, children)))
 
 
-def test_a_process_whose_parent_has_ended_before_it_could_say_so_does_not_begin() -> None:
+def test_a_process_whose_parent_has_ended_already_does_not_run() -> None:
     gone = subprocess.Popen(["true"])
     gone.wait()
     code = f"from hoidata.lifetime import end_with_parent; end_with_parent({gone.pid}); print('began')"
@@ -118,10 +118,10 @@ def command(folder: Path, body: str, before: str = "", grace: float = GRACE_S) -
     return [sys.executable, str(path)]
 
 
-def interrupted(words: list[str], *numbers: int, **options) -> tuple[int, str, float]:
-    """Exit code, what stderr says, and the seconds from the first signal to the end."""
+def interrupted(arguments: list[str], *numbers: int, **options) -> tuple[int, str, float]:
+    """Exit code, stderr, and seconds from the first signal to the end."""
     process = subprocess.Popen(
-        words,
+        arguments,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -134,28 +134,28 @@ def interrupted(words: list[str], *numbers: int, **options) -> tuple[int, str, f
         for number in numbers:
             process.send_signal(number)
             time.sleep(0.3)
-        _, told = process.communicate(timeout=30)
-        return process.returncode, told, time.monotonic() - start
+        _, stderr = process.communicate(timeout=30)
+        return process.returncode, stderr, time.monotonic() - start
     finally:
         process.kill()
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_command_says_in_words_that_it_was_interrupted(tmp_path: Path, number: int, code: int) -> None:
-    words = command(tmp_path, "import time\nprint('ready', flush=True)\ntime.sleep(60)")
-    ended, told, _ = interrupted(words, number)
-    assert (ended, told) == (code, "interrupted: nothing that was there is lost; run it again\n")
+def test_an_interrupted_command_prints_one_message(tmp_path: Path, number: int, code: int) -> None:
+    arguments = command(tmp_path, "import time\nprint('ready', flush=True)\ntime.sleep(60)")
+    exit_code, stderr, _ = interrupted(arguments, number)
+    assert (exit_code, stderr) == (code, "interrupted: finished work is kept; run it again\n")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_module_that_catches_everything_while_it_is_imported_cannot_swallow_a_signal(tmp_path: Path, number) -> None:
+def test_a_module_that_catches_all_exceptions_at_import_cannot_swallow_a_signal(tmp_path: Path, number) -> None:
     (tmp_path / "greedy.py").write_text(GREEDY)
-    ended, told, seconds = interrupted(command(tmp_path, "import greedy"), number)
-    assert (ended, told.count("\n")) == (128 + number, 1)
+    exit_code, stderr, seconds = interrupted(command(tmp_path, "import greedy"), number)
+    assert (exit_code, stderr.count("\n")) == (128 + number, 1)
     assert seconds < GRACE_S
 
 
-def test_an_interrupt_while_an_object_is_deleted_is_not_dropped(tmp_path: Path) -> None:
+def test_an_interrupt_in_a_destructor_is_not_dropped(tmp_path: Path) -> None:
     before = """
 import time
 class Slow:
@@ -163,11 +163,11 @@ class Slow:
         print('ready', flush=True)
         time.sleep(60)
 """
-    ended, told, seconds = interrupted(command(tmp_path, "Slow()\ntime.sleep(60)", before), signal.SIGINT)
-    assert (ended, told.count("\n"), seconds < GRACE_S) == (130, 1, True)
+    exit_code, stderr, seconds = interrupted(command(tmp_path, "Slow()\ntime.sleep(60)", before), signal.SIGINT)
+    assert (exit_code, stderr.count("\n"), seconds < GRACE_S) == (130, 1, True)
 
 
-CTRL_C_AT_ONCE = """
+CTRL_C_DURING_START = """
 import multiprocessing, os, signal, sys
 from hoidata.lifetime import begin_worker, ctrl_c_blocked
 if __name__ == "__main__":
@@ -183,42 +183,44 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-def test_ctrl_c_while_a_worker_process_starts_is_left_to_the_one_that_started_it(tmp_path: Path) -> None:
-    (tmp_path / "starts.py").write_text(CTRL_C_AT_ONCE)
-    words = [sys.executable, str(tmp_path / "starts.py")]
-    done = subprocess.run(words, env={**os.environ, "PYTHONPATH": "."}, capture_output=True, text=True)
+def test_ctrl_c_while_a_worker_process_starts_is_handled_by_its_parent(tmp_path: Path) -> None:
+    (tmp_path / "starts.py").write_text(CTRL_C_DURING_START)
+    arguments = [sys.executable, str(tmp_path / "starts.py")]
+    done = subprocess.run(arguments, env={**os.environ, "PYTHONPATH": "."}, capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("0\n", "")
 
 
 @pytest.mark.slow
-def test_code_that_catches_everything_ends_after_the_grace_of_less_than_ten_seconds(tmp_path: Path) -> None:
-    ended, told, seconds = interrupted(command(tmp_path, GREEDY, grace=1.0), signal.SIGTERM)
-    assert (ended, told.count("\n"), seconds >= 1) == (143, 1, True)
+def test_code_that_catches_all_exceptions_ends_after_the_grace_period(tmp_path: Path) -> None:
+    exit_code, stderr, seconds = interrupted(command(tmp_path, GREEDY, grace=1.0), signal.SIGTERM)
+    assert (exit_code, stderr.count("\n"), seconds >= 1) == (143, 1, True)
     assert GRACE_S + 1 < 10
 
 
-def test_a_second_signal_ends_a_command_at_once(tmp_path: Path) -> None:
-    ended, _, seconds = interrupted(command(tmp_path, GREEDY), signal.SIGINT, signal.SIGINT)
-    assert (ended, seconds < GRACE_S) == (130, True)
+def test_a_second_signal_ends_a_command_immediately(tmp_path: Path) -> None:
+    exit_code, _, seconds = interrupted(command(tmp_path, GREEDY), signal.SIGINT, signal.SIGINT)
+    assert (exit_code, seconds < GRACE_S) == (130, True)
 
 
 @pytest.mark.slow
-def test_code_that_lets_no_other_python_code_run_ends_as_soon(tmp_path: Path) -> None:
-    """A regular expression that takes for ever holds Python's lock: no handler and no thread can run."""
+def test_code_that_blocks_the_interpreter_lock_ends_as_soon(tmp_path: Path) -> None:
+    """An endless regular expression keeps the interpreter lock, so that no handler and no thread can run."""
     slow = "print('ready', flush=True)\ntry:\n    time.sleep(60)\nfinally:\n    re.match('(a+)+$', 'a' * 60 + 'b')"
-    ended, _, _ = interrupted(command(tmp_path, slow, "import re, time", grace=1.0), signal.SIGINT)
-    assert ended in (130, -signal.SIGALRM)
+    exit_code, _, _ = interrupted(command(tmp_path, slow, "import re, time", grace=1.0), signal.SIGINT)
+    assert exit_code in (130, -signal.SIGALRM)
 
 
-def test_a_signal_that_the_starting_script_ignores_stays_ignored(tmp_path: Path) -> None:
-    words = command(tmp_path, "import time\nprint('ready', flush=True)\ntime.sleep(1)\nreturn 0")
-    ended, told, _ = interrupted(words, signal.SIGINT, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN))
-    assert (ended, told) == (0, "")
+def test_a_signal_that_the_parent_ignores_stays_ignored(tmp_path: Path) -> None:
+    arguments = command(tmp_path, "import time\nprint('ready', flush=True)\ntime.sleep(1)\nreturn 0")
+    exit_code, stderr, _ = interrupted(
+        arguments, signal.SIGINT, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)
+    )
+    assert (exit_code, stderr) == (0, "")
 
 
-def test_an_error_that_an_interrupt_became_is_no_traceback_and_one_without_a_signal_is(tmp_path: Path) -> None:
+def test_an_error_after_an_interrupt_has_no_traceback_and_one_without_a_signal_has(tmp_path: Path) -> None:
     body = "import time\nprint('ready', flush=True)\ntry:\n    time.sleep({})\nfinally:\n    raise ValueError('odd')"
-    ended, told, _ = interrupted(command(tmp_path, body.format(60)), signal.SIGINT)
-    assert (ended, told.count("\n")) == (130, 1)
-    ended, told, _ = interrupted(command(tmp_path, body.format(0)))
-    assert (ended, "ValueError: odd" in told) == (1, True)
+    exit_code, stderr, _ = interrupted(command(tmp_path, body.format(60)), signal.SIGINT)
+    assert (exit_code, stderr.count("\n")) == (130, 1)
+    exit_code, stderr, _ = interrupted(command(tmp_path, body.format(0)))
+    assert (exit_code, "ValueError: odd" in stderr) == (1, True)

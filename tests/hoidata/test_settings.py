@@ -1,4 +1,4 @@
-"""Settings are typed once: a mapping states what differs, and a wrong one is named with what was expected."""
+"""Settings dataclasses from mappings: defaults, nested settings, and errors with the full key."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -37,11 +37,11 @@ def built(**values: Any) -> Example:
     return build_config(Example, values, "params.yaml: example")
 
 
-def test_nothing_said_gives_the_defaults():
+def test_no_values_give_the_defaults():
     assert build_config(Example, None, "here") == Example() == built()
 
 
-def test_what_is_said_replaces_the_default_and_nothing_else():
+def test_values_replace_their_defaults_only():
     example = built(size_m=1, inner={"widths": [4]}, bounds={"mass": {"high": 2}}, free={"a": None})
     assert (example.size_m, type(example.size_m)) == (1.0, float)
     assert example.inner == Inner((4,))
@@ -49,13 +49,13 @@ def test_what_is_said_replaces_the_default_and_nothing_else():
     assert (example.count, example.free) == (3, {"a": None})
 
 
-def test_plain_values_build_the_same_again():
+def test_plain_config_round_trips():
     example = built(bounds={"age": {"low": 1}}, inner={"widths": [7, 8]})
     assert build_config(Example, plain_config(example), "here") == example
 
 
 @pytest.mark.parametrize(
-    ("values", "words"),
+    ("values", "message"),
     [
         ({"cuont": 1}, "example: expected keys among: count, size_m, deep, kind, inner, bounds, free, got cuont"),
         ({"inner": {"width": 1}}, "example.inner: expected keys among: widths, got width"),
@@ -70,23 +70,23 @@ def test_plain_values_build_the_same_again():
         ({"inner": 4}, "example.inner: expected keys with values, got 4"),
     ],
 )
-def test_a_wrong_value_is_named_with_what_was_expected(values: dict, words: str):
+def test_an_error_has_the_key_and_what_was_expected(values: dict, message: str):
     with pytest.raises(BadInput) as raised:
         built(**values)
-    assert words in str(raised.value)
+    assert message in str(raised.value)
 
 
-def test_a_setting_without_default_has_to_be_given():
+def test_a_setting_without_default_is_required():
     with pytest.raises(BadInput, match="bound: expected a value for high"):
         build_config(Bound, {"low": 1}, "bound")
 
 
-def test_a_number_in_the_place_of_a_list_is_named():
+def test_a_number_instead_of_a_list_is_refused():
     with pytest.raises(BadInput, match=r"example.inner.widths: expected a list, got 0.003; write \[...\]"):
         built(inner={"widths": 0.003})
 
 
-def test_less_than_a_setting_may_be_is_named():
+def test_a_value_below_the_minimum_is_refused():
     at_least("here", Example(), "count", 3)
     with pytest.raises(BadInput, match=r"here\.count: expected 4 or more, got 3"):
         at_least("here", Example(), "count", 4)

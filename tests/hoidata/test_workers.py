@@ -1,4 +1,4 @@
-"""One function over many items in processes, some of which die. The functions are found by spawned processes here."""
+"""One function over many items in worker processes, some of which die. Spawned processes import this module."""
 
 import multiprocessing
 import os
@@ -30,14 +30,14 @@ def deadly(item: int) -> int:
 
 
 def deadly_once(path: Path) -> str:
-    """Ends its process the first time it is asked for a path."""
+    """Ends its process at the first call with a path."""
     if not path.exists():
         path.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return path.name
 
 
-def squared_beside(_ballast: bytes, item: int) -> int:
+def squared_with_ballast(_ballast: bytes, item: int) -> int:
     return item * item
 
 
@@ -53,9 +53,9 @@ def blas_threads(_: int) -> int:
 
 
 @pytest.mark.slow
-def test_an_item_that_kills_every_process_is_given_up_and_all_others_are_done():
-    found = dict(in_workers(deadly, range(6), 2, on_lost=lambda error: f"{error.item}: {error.cause}"))
-    assert found == {0: 0, 1: 1, 2: 4, 3: "3: signal SIGSEGV", 4: 16, 5: 25}
+def test_an_item_that_kills_each_process_is_lost_and_all_others_are_done():
+    results = dict(in_workers(deadly, range(6), 2, on_lost=lambda error: f"{error.item}: {error.cause}"))
+    assert results == {0: 0, 1: 1, 2: 4, 3: "3: signal SIGSEGV", 4: 16, 5: 25}
     done = []
     with pytest.raises(WorkerLost, match=r"3: expected.*SIGSEGV"):
         done.extend(item for item, _ in in_workers(deadly, range(6), 2))
@@ -63,32 +63,31 @@ def test_an_item_that_kills_every_process_is_given_up_and_all_others_are_done():
 
 
 @pytest.mark.slow
-def test_processes_that_die_once_each_cost_nothing(tmp_path):
+def test_an_item_whose_process_dies_once_is_repeated(tmp_path):
     paths = [tmp_path / str(number) for number in range(3)]
     assert dict(in_workers(deadly_once, paths, 2)) == {path: path.name for path in paths}
 
 
 @pytest.mark.slow
-def test_a_process_that_dies_before_it_read_what_it_is_for_costs_nothing():
-    """More than a pipe holds, which the parent would go on writing to nobody."""
-
+def test_a_process_that_dies_before_it_reads_its_function_is_replaced():
+    """The function is larger than the buffer of a pipe, so that the parent could block while it writes."""
     killed, over = [], threading.Event()
 
     def kill_the_first() -> None:
         while not killed and not over.wait(0.001):
-            # Of all children: numbers of processes start again at the largest, so the newest is not the last.
+            # Search all children: process ids wrap around, so the newest child may not be the last one.
             for child in psutil.Process().children():
                 with suppress(psutil.Error):
                     if not killed and "spawn_main" in " ".join(child.cmdline()):
                         child.kill()
                         killed.append(child.pid)
 
-    signal.signal(signal.SIGALRM, lambda *_: pytest.fail("waits for a process that is dead"))
+    signal.signal(signal.SIGALRM, lambda *_: pytest.fail("waits for a dead process"))
     killer = threading.Thread(target=kill_the_first)
     killer.start()
     signal.alarm(60)
     try:
-        assert dict(in_workers(partial(squared_beside, bytes(1 << 20)), range(4), 2)) == {0: 0, 1: 1, 2: 4, 3: 9}
+        assert dict(in_workers(partial(squared_with_ballast, bytes(1 << 20)), range(4), 2)) == {0: 0, 1: 1, 2: 4, 3: 9}
     finally:
         signal.alarm(0)
         over.set()
@@ -97,7 +96,7 @@ def test_a_process_that_dies_before_it_read_what_it_is_for_costs_nothing():
 
 
 @pytest.mark.slow
-def test_what_the_function_raises_names_the_item_and_ends_the_workers():
+def test_an_exception_of_the_function_names_the_item_and_ends_the_workers():
     with pytest.raises(RuntimeError, match=r"3: Traceback(?s:.)*ZeroDivisionError"):
         list(in_workers(broken, range(6), 2))
     assert not multiprocessing.active_children()
@@ -133,9 +132,9 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("code", "count"), [(WORKERS, 2), (POOL, 1)], ids=["workers", "pool of the adapters' check"])
+@pytest.mark.parametrize(("code", "count"), [(WORKERS, 2), (POOL, 1)], ids=["workers", "pool of adapters check"])
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
-def test_worker_processes_end_with_the_one_that_started_them(tmp_path, code, count, sent):
+def test_worker_processes_end_with_their_parent(tmp_path, code, count, sent):
     (tmp_path / "script.py").write_text(code)
     starter = subprocess.Popen(
         [sys.executable, tmp_path / "script.py"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -150,17 +149,17 @@ def test_worker_processes_end_with_the_one_that_started_them(tmp_path, code, cou
     starter.communicate()
 
 
-def test_one_job_works_here():
+def test_one_job_works_in_this_process():
     assert list(in_workers(squared, range(3), 1)) == [(0, 0), (1, 1), (2, 4)]
 
 
-def test_one_job_has_one_thread_of_blas_and_leaves_the_others_as_they_were():
+def test_one_job_uses_one_blas_thread_and_restores_the_number():
     with threadpool_limits(2, user_api="blas"):
         assert list(in_workers(blas_threads, [0], 1)) == [(0, 1)]
         assert blas_threads(0) == 2
 
 
-def test_a_lost_worker_is_a_bad_input_in_every_process():
+def test_a_lost_worker_can_be_pickled():
     import pickle
 
     error = pickle.loads(pickle.dumps(WorkerLost("grab/s1/1", "signal SIGSEGV")))

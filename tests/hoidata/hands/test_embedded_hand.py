@@ -1,3 +1,5 @@
+"""The embedded hand: mesh, weights, mirroring, pose correctives and digest."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -41,7 +43,7 @@ def test_mesh_is_a_disc_with_manos_counts(pair, side):
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_faces_look_outward(pair, side):
+def test_faces_point_outward(pair, side):
     model = pair[side]
     normals = vertex_normals(model.template_m, model.faces)
     back_of_hand = model.template_m[:, 1].argmax()
@@ -70,7 +72,7 @@ def test_fingers_point_to_minus_x_back_up_and_thumb_to_plus_z(pair):
     assert joints[15, 2] > joints[1, 2]
 
 
-def test_every_tip_id_known_for_mano_lies_on_its_fingertip(pair):
+def test_all_tip_ids_used_for_mano_are_on_the_fingertips(pair):
     model = pair.right
     joints = model.rest_joints_m(np.zeros((1, 10)))[0]
     for distal, ids in SMPLX_AND_OTHER_TIP_IDS.items():
@@ -82,7 +84,7 @@ def test_every_tip_id_known_for_mano_lies_on_its_fingertip(pair):
     assert {ids for group in SMPLX_AND_OTHER_TIP_IDS.values() for ids in group} > set(TIP_VERTICES)
 
 
-def test_wrist_is_not_at_the_origin_so_that_a_missing_root_offset_shows(pair):
+def test_the_wrist_is_not_at_the_origin(pair):
     np.testing.assert_allclose(pair.right.wrist_offset_m(np.zeros((1, 10)))[0], (0.096, 0.006, 0.006), atol=5e-4)
     np.testing.assert_allclose(pair.left.wrist_offset_m(np.zeros((1, 10)))[0], (-0.096, 0.006, 0.006), atol=5e-4)
 
@@ -93,10 +95,10 @@ def test_left_model_mirrors_the_right_one(pair):
     np.testing.assert_array_equal(left.template_m, right.template_m * mirror)
     np.testing.assert_array_equal(left.shape_directions, right.shape_directions * mirror[:, None])
     np.testing.assert_array_equal(left.mean_pose, mirror_rotvec_x(right.mean_pose.reshape(15, 3)).ravel())
-    # Equal coefficients give mirrored poses: GRAB's files are read through these rows where they lack full poses.
+    # Equal coefficients give mirrored poses. GRAB's files without full poses are read with these components.
     flip = np.tile([1.0, -1.0, -1.0], 15)
     np.testing.assert_array_equal(left.components[:24], right.components[:24] * flip)
-    # The public fix for MANO's left shape directions is triggered by a sum below 1; it must leave this hand alone.
+    # The public fix of MANO's left shape directions applies if this sum is below 1. It must not apply to this hand.
     assert np.abs(left.shape_directions[:, 0] - right.shape_directions[:, 0]).sum() > 1
     rebuilt = pose_correctives(right.template_m, right.faces, right.skin_weights)
     np.testing.assert_array_equal(rebuilt, right.pose_directions)
@@ -128,7 +130,7 @@ def test_pose_components_are_orthonormal_and_the_mean_is_a_curled_hand(pair):
     assert (pair.right.mean_pose.reshape(15, 3)[:12, 2] > 0.1).all()
 
 
-def test_asset_is_small_and_says_where_it_comes_from():
+def test_the_asset_is_small_and_has_its_provenance():
     assert ASSET.stat().st_size <= 150_000
     with np.load(ASSET) as asset:
         provenance = str(asset["provenance"])
@@ -136,7 +138,7 @@ def test_asset_is_small_and_says_where_it_comes_from():
     assert "CC0" in provenance
 
 
-def test_digest_follows_the_content_and_the_side(pair):
+def test_the_digest_depends_on_content_and_side(pair):
     assert pair.left.digest != pair.right.digest
     assert load_embedded_hands().digest == pair.digest
     other = replace(pair.right, template_m=pair.right.template_m + 1e-9)
@@ -144,7 +146,7 @@ def test_digest_follows_the_content_and_the_side(pair):
 
 
 @pytest.mark.parametrize(
-    ("field", "spoil"),
+    ("field", "corrupt"),
     [
         ("skin_weights", lambda array: array * 1.01),
         ("template_m", lambda array: array[:-1]),
@@ -153,8 +155,8 @@ def test_digest_follows_the_content_and_the_side(pair):
         ("faces", lambda array: array + 1),
     ],
 )
-def test_impossible_arrays_are_refused_by_name(pair, field, spoil):
+def test_impossible_arrays_are_refused(pair, field, corrupt):
     values = {name: getattr(pair.right, name) for name in pair.right.__dataclass_fields__}
-    values[field] = spoil(values[field])
+    values[field] = corrupt(values[field])
     with pytest.raises(BadInput, match=field):
         checked_model("somewhere", "do something", **values)

@@ -1,4 +1,4 @@
-"""Fitting a MANO-layout hand to keypoints: hands made by the model itself come back; bad keypoints are refused."""
+"""Fitting a MANO-layout hand to keypoints: poses of the model are recovered; bad keypoints are refused."""
 
 from types import SimpleNamespace
 
@@ -16,7 +16,7 @@ HANDS = load_embedded_hands()
 
 
 def waving_hand(side: str, betas: np.ndarray, seed: int) -> SimpleNamespace:
-    """A hand that opens and closes its fingers while it moves and turns through the room."""
+    """A hand that opens and closes its fingers while it moves and rotates in the world."""
     random = np.random.default_rng(seed)
     time = np.linspace(0, 3, N_FRAMES)[:, None]
     pose = HANDS[side].mean_pose + 0.05 * np.sin(time + random.uniform(0, 6, (1, 45)))
@@ -46,24 +46,24 @@ def keypoints(betas: np.ndarray) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.slow
-def test_hands_made_by_the_model_come_back_with_one_shape_for_both_sides(keypoints: dict) -> None:
+def test_poses_of_the_model_are_recovered_with_one_shape_for_both_sides(keypoints: dict) -> None:
     fits = fit_hands(keypoints, HANDS)
     np.testing.assert_array_equal(fits["left"].betas, fits["right"].betas)
     for side, fit in fits.items():
         assert fit.error_m.mean() < 0.0005
         assert fit.error_m.max() < 0.0015
-        again = SimpleNamespace(**{**vars(fit), "template_m": None})
-        error = np.linalg.norm(keypoints_of(again, side) - keypoints[side], axis=-1)
+        fitted = SimpleNamespace(**{**vars(fit), "template_m": None})
+        error = np.linalg.norm(keypoints_of(fitted, side) - keypoints[side], axis=-1)
         np.testing.assert_allclose(error, fit.error_m, atol=1e-6)
 
 
-def test_a_known_shape_is_kept_and_gives_back_place_and_orientation(keypoints: dict, betas: np.ndarray) -> None:
+def test_with_a_known_shape_position_and_orientation_are_recovered(keypoints: dict, betas: np.ndarray) -> None:
     fit = fit_hands(keypoints, HANDS, betas)["right"]
     truth = waving_hand("right", betas, 1)
     np.testing.assert_array_equal(fit.betas[0], betas)
     np.testing.assert_allclose(fit.wrist_m, truth.wrist_m, atol=0.001)
-    turned = Rotation.from_rotvec(fit.global_orient).inv() * Rotation.from_rotvec(truth.global_orient)
-    assert np.rad2deg(turned.magnitude().max()) < 2
+    error = Rotation.from_rotvec(fit.global_orient).inv() * Rotation.from_rotvec(truth.global_orient)
+    assert np.rad2deg(error.magnitude().max()) < 2
 
 
 def test_mirrored_keypoints_give_the_mirrored_hand(keypoints: dict, betas: np.ndarray) -> None:
@@ -74,17 +74,17 @@ def test_mirrored_keypoints_give_the_mirrored_hand(keypoints: dict, betas: np.nd
     np.testing.assert_allclose(left.hand_pose, right.hand_pose * flip, atol=1e-4)
 
 
-def test_the_pose_is_unchanged_when_the_world_turns(keypoints: dict, betas: np.ndarray) -> None:
-    turn = Rotation.from_rotvec([0.3, -1.2, 2.0])
+def test_the_pose_does_not_depend_on_the_world_frame(keypoints: dict, betas: np.ndarray) -> None:
+    rotation = Rotation.from_rotvec([0.3, -1.2, 2.0])
     still = fit_hands({"right": keypoints["right"]}, HANDS, betas)["right"]
     shift = np.array([1.0, 2.0, 3.0])
-    points = turn.apply(keypoints["right"].reshape(-1, 3)).reshape(-1, 21, 3) + shift
+    points = rotation.apply(keypoints["right"].reshape(-1, 3)).reshape(-1, 21, 3) + shift
     moved = fit_hands({"right": points}, HANDS, betas)["right"]
     np.testing.assert_allclose(moved.hand_pose, still.hand_pose, atol=1e-5)
-    np.testing.assert_allclose(moved.wrist_m, turn.apply(still.wrist_m) + shift, atol=1e-6)
+    np.testing.assert_allclose(moved.wrist_m, rotation.apply(still.wrist_m) + shift, atol=1e-6)
 
 
-def test_unknown_keypoints_are_left_out_and_the_others_still_fit(keypoints: dict, betas: np.ndarray) -> None:
+def test_unknown_keypoints_are_ignored(keypoints: dict, betas: np.ndarray) -> None:
     points = keypoints["right"].copy()
     points[:, [5, 13]] = np.nan
     points[3, 16:] = np.nan
@@ -109,14 +109,14 @@ def test_equal_keypoints_give_equal_bytes(keypoints: dict) -> None:
 
 
 @pytest.mark.slow
-def test_more_frames_of_a_foreign_skeleton_do_not_drive_the_shape_away(keypoints: dict) -> None:
+def test_many_frames_of_another_skeleton_give_a_moderate_shape(keypoints: dict) -> None:
     stretched = {side: points.copy() for side, points in keypoints.items()}
     for points in stretched.values():
         points[:, 1:13:3] += 0.3 * (points[:, :1] - points[:, 1:13:3])
     assert np.abs(fit_shape(stretched, HANDS)).max() < 4
 
 
-def test_weights_decide_which_keypoints_fit_best(keypoints: dict) -> None:
+def test_keypoints_of_larger_weight_fit_better(keypoints: dict) -> None:
     shifted = keypoints["right"].copy()
     shifted[:, 16:] += [0.0, 0.01, 0.0]
     even, tips = (

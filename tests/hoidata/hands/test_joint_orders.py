@@ -23,17 +23,17 @@ OPENPOSE_NAMES = [
 
 
 def numbered(names: list[str]) -> np.ndarray:
-    """(2 frames, 21, 3): joint ``name`` holds its place in MANO's list, whatever the order it is given in."""
+    """(2 frames, 21, 3): the coordinates of each joint are its index in MANO's list, for any order of ``names``."""
     one = np.array([[MANO.index(name), MANO.index(name) + 0.1, MANO.index(name) + 0.2] for name in names])
     return np.stack([one, one + 100])
 
 
-def test_our_own_order_is_manos_with_the_tips_at_the_end():
+def test_the_joint_order_is_manos_with_the_tips_at_the_end():
     assert list(JOINT_NAMES) == MANO
 
 
 def test_openpose_order_goes_finger_by_finger_from_the_thumb():
-    assert [MANO[place] for place in OPENPOSE] == OPENPOSE_NAMES
+    assert [MANO[index] for index in OPENPOSE] == OPENPOSE_NAMES
     np.testing.assert_array_equal(openpose_to_mano_order(numbered(OPENPOSE_NAMES)), numbered(MANO))
 
 

@@ -1,3 +1,5 @@
+"""Forward kinematics against skinning with 4 x 4 matrices, rigid motion, mirroring and gradients."""
+
 import numpy as np
 import pytest
 import torch
@@ -15,8 +17,8 @@ def torch_inputs(track, dtype=torch.float64):
     return [torch.as_tensor(array, dtype=dtype) for array in arrays]
 
 
-def skinned_one_by_one(model, wrist_m, rotvec, betas, template_m):
-    """Linear blend skinning of one frame written as 4 x 4 matrices and loops, with the matrix exponential."""
+def reference_skinning(model, wrist_m, rotvec, betas, template_m):
+    """Linear blend skinning of one frame with 4 x 4 matrices, loops and the matrix exponential."""
     template = model.template_m if template_m is None else template_m
     local = [expm(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])) for x, y, z in rotvec]
     shaped = template + model.shape_directions @ betas
@@ -38,24 +40,24 @@ def skinned_one_by_one(model, wrist_m, rotvec, betas, template_m):
 
 @pytest.mark.parametrize("side", ["left", "right"])
 @pytest.mark.parametrize("with_template", [False, True])
-def test_track_functions_equal_skinning_written_out_with_matrices(side, with_template):
+def test_track_functions_equal_the_reference_skinning(side, with_template):
     model = load_embedded_hands()[side]
     template = model.template_m * 0.93 + 0.01 if with_template else None
     track = random_hand(3, betas_rows=3, template_m=template)
     vertices, joints = track_vertices(track, model), track_joints(track, model)
     for frame in range(3):
         rotvec = np.concatenate((track.global_orient[frame], track.hand_pose[frame])).reshape(16, 3)
-        wanted = skinned_one_by_one(model, track.wrist_m[frame], rotvec, track.betas[frame], template)
-        np.testing.assert_allclose(vertices[frame], wanted[0], atol=2e-7)
-        np.testing.assert_allclose(joints[frame, :16], wanted[1], atol=2e-7)
-        np.testing.assert_allclose(joints[frame, 16:], wanted[0][list(TIP_VERTICES)], atol=2e-7)
+        expected = reference_skinning(model, track.wrist_m[frame], rotvec, track.betas[frame], template)
+        np.testing.assert_allclose(vertices[frame], expected[0], atol=2e-7)
+        np.testing.assert_allclose(joints[frame, :16], expected[1], atol=2e-7)
+        np.testing.assert_allclose(joints[frame, 16:], expected[0][list(TIP_VERTICES)], atol=2e-7)
 
 
 def test_identity_pose_is_the_template_moved_to_the_wrist():
     model = load_embedded_hands().right
     track = random_hand(1)
     wrist = np.array([[0.3, -0.2, 1.1]])
-    flat = HandTrack(wrist, np.zeros((1, 3)), np.zeros((1, 45)), np.zeros((1, 10)), track.valid)
+    flat = HandTrack(wrist, np.zeros((1, 3)), np.zeros((1, 45)), betas=np.zeros((1, 10)), valid=track.valid)
     expected = model.template_m - model.wrist_offset_m(np.zeros((1, 10))) + wrist
     np.testing.assert_allclose(track_vertices(flat, model)[0], expected, atol=1e-7)
 
@@ -71,22 +73,22 @@ def test_joints_only_path_equals_the_full_path(with_template):
     )
 
 
-def test_wrist_joint_lies_exactly_where_it_was_put():
+def test_the_wrist_joint_is_exactly_at_wrist_m():
     inputs = torch_inputs(random_hand(7), torch.float32)
     joints = HandKinematics(load_embedded_hands().left).joints(*inputs)
     assert torch.equal(joints[:, 0], inputs[0])
 
 
-def test_hand_follows_a_rigid_motion_of_the_world():
+def test_joints_and_vertices_follow_a_rigid_motion_of_the_world():
     layer = HandKinematics(load_embedded_hands().right, torch.float64)
     wrist, rotmats, betas = torch_inputs(random_hand(4))
-    turn = rotvec_to_rotmat(torch.tensor([0.4, -1.1, 0.7], dtype=torch.float64))
+    rotation = rotvec_to_rotmat(torch.tensor([0.4, -1.1, 0.7], dtype=torch.float64))
     shift = torch.tensor([0.2, 3.0, -1.0], dtype=torch.float64)
-    moved = torch.cat((turn @ rotmats[:, :1], rotmats[:, 1:]), 1)
+    moved = torch.cat((rotation @ rotmats[:, :1], rotmats[:, 1:]), 1)
     vertices, joints = layer(wrist, rotmats, betas)
-    moved_vertices, moved_joints = layer(wrist @ turn.T + shift, moved, betas)
-    torch.testing.assert_close(moved_vertices, vertices @ turn.T + shift, atol=1e-12, rtol=0)
-    torch.testing.assert_close(moved_joints, joints @ turn.T + shift, atol=1e-12, rtol=0)
+    moved_vertices, moved_joints = layer(wrist @ rotation.T + shift, moved, betas)
+    torch.testing.assert_close(moved_vertices, vertices @ rotation.T + shift, atol=1e-12, rtol=0)
+    torch.testing.assert_close(moved_joints, joints @ rotation.T + shift, atol=1e-12, rtol=0)
 
 
 def test_left_hand_is_the_right_hand_in_a_mirror():
@@ -104,16 +106,16 @@ def test_left_hand_is_the_right_hand_in_a_mirror():
     np.testing.assert_allclose(track_vertices(left, pair.left), expected, atol=1e-7)
 
 
-def test_positive_turn_about_z_bends_every_finger_towards_the_palm():
+def test_positive_rotation_about_z_bends_each_finger_towards_the_palm():
     model = load_embedded_hands().right
     bent = np.zeros((1, 15, 3))
     bent[:, :12, 2] = 0.8
-    still = random_hand(1)
     zero = np.zeros((1, 3))
-    flat = HandTrack(zero, zero, np.zeros((1, 45)), np.zeros((1, 10)), still.valid)
-    curled = HandTrack(zero, zero, bent.reshape(1, 45), np.zeros((1, 10)), still.valid)
+    betas, valid = np.zeros((1, 10)), random_hand(1).valid
+    flat = HandTrack(zero, zero, np.zeros((1, 45)), betas=betas, valid=valid)
+    curled = HandTrack(zero, zero, bent.reshape(1, 45), betas=betas, valid=valid)
     drop_m = track_joints(flat, model)[0, 16:20, 1] - track_joints(curled, model)[0, 16:20, 1]
-    assert (drop_m > 0.02).all()  # the palm looks to -y
+    assert (drop_m > 0.02).all()  # the palm faces -y
 
 
 def test_gradients_are_right_and_finite_at_zero_pose():
@@ -132,7 +134,7 @@ def test_gradients_are_right_and_finite_at_zero_pose():
     assert all(torch.isfinite(gradient).all() and gradient.abs().max() > 0 for gradient in gradients)
 
 
-def test_long_tracks_come_out_the_same_in_chunks_and_frame_by_frame():
+def test_long_tracks_give_the_joints_of_single_frames():
     model = load_embedded_hands().right
     track = random_hand(1030, betas_rows=1030)
     joints = track_joints(track, model)

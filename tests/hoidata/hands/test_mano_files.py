@@ -1,4 +1,4 @@
-"""MANO files: a fixture in the byte layout of the released ones (Python 2, chumpy, SciPy), written opcode by opcode."""
+"""MANO files: fixtures in the byte layout of the released files (Python 2, chumpy, SciPy), written by opcode."""
 
 import os
 import pickle
@@ -62,8 +62,8 @@ def chumpy_select(directions):
     """Shape directions as released: elements of a (778, 3, 20) chumpy array."""
     all_20 = np.concatenate((directions, np.full_like(directions, 7.0)), axis=2)
     ids = np.arange(all_20.size).reshape(all_20.shape)[..., :10].ravel()
-    nothing = b"c__builtin__\nset\n](" + text("x") + b"e\x85R"
-    inner = instance("chumpy.ch", "Ch", {"x": array(all_20), "_dirty_vars": nothing, "_itr": b"N"})
+    empty_set = b"c__builtin__\nset\n](" + text("x") + b"e\x85R"
+    inner = instance("chumpy.ch", "Ch", {"x": array(all_20), "_dirty_vars": empty_set, "_itr": b"N"})
     shape = group(*(integer(length) for length in directions.shape))
     return instance(
         "chumpy.reordering",
@@ -81,7 +81,7 @@ def sparse(matrix):
 
 
 def released_layout(model, **replaced):
-    """The bytes of a file as the MANO project publishes it, with this model's numbers."""
+    """The bytes of a file in the layout of the MANO project, with the numbers of ``model``."""
     parents = np.array([[2**32 - 1, *model.parents[1:]], range(16)], dtype=np.int64)
     content = {
         "hands_components": array(model.components),
@@ -122,7 +122,7 @@ def test_released_layout_loads_without_chumpy(released_folder):
     pair = load_mano_hands(released_folder)
     assert not any(name.startswith(("chumpy", "scipy.sparse.csc")) for name in set(sys.modules) - before)
     assert pair.name == "mano"
-    assert pair.digest == load_embedded_hands().digest  # every number came through
+    assert pair.digest == load_embedded_hands().digest  # all numbers are equal
 
 
 def test_models_folder_is_found_below_the_unpacked_download(released_folder, tmp_path_factory):
@@ -139,7 +139,7 @@ def test_plain_file_round_trips(tmp_path):
     assert load_mano_hands(tmp_path).digest == pair.digest
 
 
-def test_missing_file_says_which_and_where_to_register(tmp_path):
+def test_a_missing_file_is_named_with_the_place_to_register(tmp_path):
     with pytest.raises(MissingResource, match=r"MANO_LEFT\.pkl.*mano\.is\.tue\.mpg\.de"):
         load_mano_hands(tmp_path)
 
@@ -171,7 +171,7 @@ def test_command_hidden_in_a_whole_mano_file_is_refused_and_nothing_runs(release
 
 
 @pytest.mark.parametrize(
-    ("key", "spoilt", "named"),
+    ("key", "corrupted", "field"),
     [
         ("weights", lambda model: array(model.skin_weights * 1.1), "skin_weights"),
         ("v_template", lambda model: array(model.template_m[:700]), "template_m"),
@@ -182,10 +182,10 @@ def test_command_hidden_in_a_whole_mano_file_is_refused_and_nothing_runs(release
         ("kintree_table", lambda model: array(np.zeros((2, 16), dtype=np.int64)), "parents"),
     ],
 )
-def test_file_with_impossible_content_is_refused_by_name(released_folder, key, spoilt, named):
+def test_impossible_content_is_refused(released_folder, key, corrupted, field):
     model = load_embedded_hands().left
-    (released_folder / "MANO_LEFT.pkl").write_bytes(released_layout(model, **{key: spoilt(model)}))
-    with pytest.raises(BadInput, match=rf"MANO_LEFT\.pkl: {named}"):
+    (released_folder / "MANO_LEFT.pkl").write_bytes(released_layout(model, **{key: corrupted(model)}))
+    with pytest.raises(BadInput, match=rf"MANO_LEFT\.pkl: {field}"):
         load_mano_hands(released_folder)
 
 

@@ -25,12 +25,12 @@ def mano_folder(tmp_path_factory):
 
 
 def oracle(folder, side, flat, dtype, inputs):
-    # smplx announces its 10 shape coefficients on stdout each time.
-    with contextlib.redirect_stdout(io.StringIO()) as said:
+    # smplx prints its 10 shape coefficients at each construction.
+    with contextlib.redirect_stdout(io.StringIO()) as output:
         layer = smplx.MANO(
             str(folder), is_rhand=side == "right", use_pca=False, flat_hand_mean=flat, batch_size=BATCH, dtype=dtype
         )
-    assert "10 shape coefficients" in said.getvalue()
+    assert "10 shape coefficients" in output.getvalue()
     out = layer(**inputs)
     return out.vertices.detach(), out.joints.detach()
 
@@ -50,7 +50,7 @@ def random_inputs(dtype):
 def test_layer_equals_smplx(mano_folder, side, flat, dtype, tolerance_m):
     model = load_mano_hands(mano_folder)[side]
     inputs = random_inputs(dtype)
-    wanted_vertices, wanted_joints = oracle(mano_folder, side, flat, dtype, inputs)
+    expected_vertices, expected_joints = oracle(mano_folder, side, flat, dtype, inputs)
 
     mean = 0.0 if flat else torch.as_tensor(model.mean_pose, dtype=dtype)
     pose = torch.cat((inputs["global_orient"], inputs["hand_pose"] + mean), 1)
@@ -58,10 +58,10 @@ def test_layer_equals_smplx(mano_folder, side, flat, dtype, tolerance_m):
     wrist_m = inputs["transl"] + torch.as_tensor(model.wrist_offset_m(inputs["betas"].numpy()), dtype=dtype)
     vertices, joints = HandKinematics(model, dtype)(wrist_m, rotmats, inputs["betas"])
 
-    error_m = max((vertices - wanted_vertices).abs().max(), (joints[:, :16] - wanted_joints).abs().max())
+    error_m = max((vertices - expected_vertices).abs().max(), (joints[:, :16] - expected_joints).abs().max())
     assert error_m < tolerance_m
-    assert (joints[:, 16:] - wanted_vertices[:, list(TIP_VERTICES)]).abs().max() < tolerance_m
-    assert not flat or np.abs(model.mean_pose).max() > 0.1  # or the mean-pose case would test nothing
+    assert (joints[:, 16:] - expected_vertices[:, list(TIP_VERTICES)]).abs().max() < tolerance_m
+    assert not flat or np.abs(model.mean_pose).max() > 0.1  # otherwise the mean-pose case tests nothing
 
 
 def test_layer_equals_smplx_on_a_personal_template(mano_folder):
@@ -73,11 +73,11 @@ def test_layer_equals_smplx_on_a_personal_template(mano_folder):
             str(mano_folder), is_rhand=True, use_pca=False, flat_hand_mean=True, batch_size=BATCH,
             dtype=torch.float64, v_template=torch.as_tensor(personal),
         )  # fmt: skip
-    wanted = layer(**inputs).vertices.detach()
+    expected = layer(**inputs).vertices.detach()
 
     pose = torch.cat((inputs["global_orient"], inputs["hand_pose"]), 1)
     wrist_m = inputs["transl"] + torch.as_tensor(model.wrist_offset_m(np.zeros((1, 10)), personal))
     vertices, _ = HandKinematics(model, torch.float64)(
         wrist_m, rotvec_to_rotmat(pose.reshape(BATCH, 16, 3)), inputs["betas"], torch.as_tensor(personal)
     )
-    assert (vertices - wanted).abs().max() < 1e-7
+    assert (vertices - expected).abs().max() < 1e-7

@@ -17,7 +17,7 @@ HANDS = load_embedded_hands()
 
 
 def with_shared_tips(model: HandModel) -> HandModel:
-    """Tips that follow several joints and move with every pose, as in MANO; the embedded hand's are simpler."""
+    """The model with tips that follow several joints and have pose correctives, as in MANO."""
     rng, tips = np.random.default_rng(8), list(TIP_VERTICES)
     weights, pose = model.skin_weights.copy(), model.pose_directions.copy()
     weights[tips] = rng.dirichlet(np.full(16, 0.3), 5)
@@ -26,7 +26,7 @@ def with_shared_tips(model: HandModel) -> HandModel:
 
 
 def layer_joints_m(track: HandTrack, model: HandModel) -> np.ndarray:
-    """float64 joints of the full-vertex path, not rounded."""
+    """float64 joints from all vertices."""
     rotvec = np.concatenate((track.global_orient, track.hand_pose), axis=1, dtype=np.float64).reshape(-1, 16, 3)
     arrays = (track.wrist_m, rotvec_to_rotmat(rotvec), track.betas)
     inputs = [torch.as_tensor(np.asarray(array, dtype=np.float64)) for array in arrays]

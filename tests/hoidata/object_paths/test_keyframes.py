@@ -1,4 +1,4 @@
-"""Keyframes are reached at their times, and nothing happens between them that was not asked for."""
+"""Keyframes are reached at their times, without overshoot; impossible ones are refused with a remedy."""
 
 import json
 import re
@@ -31,8 +31,8 @@ def laptop() -> ObjectModel:
     return two_parts(base, lid, (1, 0, 0), (0.5, 0.1, 0.31), "laptop")
 
 
-def moved(keys: str, model: ObjectModel | None = None, **wish) -> ObjectPath:
-    return keyframed_path(model or laptop(), parse_keyframes(keys.encode(), "k.csv"), **wish)
+def moved(csv: str, model: ObjectModel | None = None, **options) -> ObjectPath:
+    return keyframed_path(model or laptop(), parse_keyframes(csv.encode(), "k.csv"), **options)
 
 
 def heights(path: ObjectPath) -> np.ndarray:
@@ -41,7 +41,7 @@ def heights(path: ObjectPath) -> np.ndarray:
     return path.track.points_in_world(model.vertices_m, model.part)[:, model.part == 0, 2].min(axis=1)
 
 
-def test_every_key_is_reached_at_its_time_and_a_hold_stays():
+def test_every_keyframe_is_reached_at_its_time_and_equal_keyframes_do_not_move():
     path = keyframed_path(hinged_box(), parse_keyframes(CSV, "k.csv"))
     track = path.track
     assert track.n_frames == 4.5 * 30 + 1
@@ -57,12 +57,12 @@ def test_every_key_is_reached_at_its_time_and_a_hold_stays():
 
 
 def test_json_csv_quaternions_and_every_unit_mean_the_same():
-    turn = Rotation.from_rotvec([0.3, -0.2, 0.9])
-    x, y, z, w = turn.as_quat()
+    rotation = Rotation.from_rotvec([0.3, -0.2, 0.9])
+    x, y, z, w = rotation.as_quat()
     rows = [{"time_ms": 0, "z_mm": 0, "qw": 1, "qx": 0, "qy": 0, "qz": 0}]
     rows.append({"time_ms": 1500, "z_mm": 400, "qw": w, "qx": x, "qy": y, "qz": z})
     one = parse_keyframes(json.dumps({"keyframes": rows}).encode(), "k.json")
-    vector = ",".join(f"{value:.17g}" for value in np.degrees(turn.as_rotvec()))
+    vector = ",".join(f"{value:.17g}" for value in np.degrees(rotation.as_rotvec()))
     other = parse_keyframes(f"time_s,z_m,rx_deg,ry_deg,rz_deg\n2,0,0,0,0\n3.5,0.4,{vector}\n".encode(), "k.csv")
     tracks = [keyframed_path(box_model(), keys).track for keys in (one, other)]
     assert tracks[0].rotvec == pytest.approx(tracks[1].rotvec, abs=1e-6)
@@ -77,7 +77,7 @@ def test_velocity_passes_through_a_key_without_a_stop():
 
 
 @pytest.mark.parametrize(
-    ("data", "words"),
+    ("data", "message"),
     [
         (b"", "2 to 5000 keyframes"),
         (b"time_s,x\n0,0\n1,1\n", "x_m, x_cm, x_mm"),
@@ -106,26 +106,26 @@ def test_velocity_passes_through_a_key_without_a_stop():
         (b"[1, 2]", "a list of objects"),
         (b'[{"time_s": 0}, {"time_s": 1, "z_m": 0.1}]', "the same names"),
         (b'[{"time_s": [0]}, {"time_s": 1}]', "a number"),
-        (b"\xff\xfe", "export it anew"),
-        (b"[" * 100_000, "export it anew"),
+        (b"\xff\xfe", "export it again"),
+        (b"[" * 100_000, "export it again"),
     ],
 )
-def test_what_cannot_be_gets_an_answer_that_says_what_to_do(data, words):
+def test_impossible_keyframes_are_refused_with_a_remedy(data, message):
     with pytest.raises(BadInput) as error:
         keyframed_path(box_model(), parse_keyframes(data, "k"))
-    assert words in str(error.value)
+    assert message in str(error.value)
 
 
 @pytest.mark.parametrize("degrees", [200, 270, 360, -720])
 @pytest.mark.parametrize("axis", ["rx", "rz"])
-def test_a_turn_about_one_axis_goes_as_far_round_as_it_is_written(axis, degrees):
+def test_a_rotation_about_one_axis_may_exceed_half_a_turn(axis, degrees):
     keys = parse_keyframes(f"time_s,z_cm,{axis}_deg\n0,40,10\n4,40,10\n9,40,{10 + degrees}\n".encode(), "k.csv")
     turns = Rotation.from_rotvec(keyframed_path(box_model(), keys).track.rotvec.astype(float))
     whole = np.degrees((turns[1:] * turns[:-1].inv()).as_rotvec()).sum(axis=0)
     assert whole == pytest.approx(degrees * np.eye(3)["xyz".index(axis[1])], abs=1e-2)
 
 
-def test_a_hinge_beyond_180_degrees_needs_a_range_that_says_so():
+def test_a_hinge_angle_beyond_180_degrees_needs_a_range():
     keys = parse_keyframes(b"time_s,z_cm,hinge_deg\n0,40,0\n9,40,-200\n", "k.csv")
     with pytest.raises(BadInput, match="--hinge-range"):
         keyframed_path(hinged_box(), keys)
@@ -133,13 +133,13 @@ def test_a_hinge_beyond_180_degrees_needs_a_range_that_says_so():
     assert np.degrees(path.track.hinge_rad.min()) == pytest.approx(-200, abs=1e-3)
 
 
-def test_an_angle_beyond_the_stop_names_the_stop():
+def test_an_angle_outside_the_limits_names_the_limits():
     keys = parse_keyframes(b"time_s,hinge_deg\n0,0\n2,-80\n", "k.csv")
     with pytest.raises(BadInput, match="-45 to 0 deg, got -80 deg"):
         keyframed_path(hinged_box(), keys, (np.radians(-45), 0.0))
 
 
-def test_a_file_that_is_not_there_is_an_answer(tmp_path):
+def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(BadInput, match="correct the path"):
         read_keyframes(tmp_path / "none.csv")
     (tmp_path / "keys.csv").write_bytes(CSV)
@@ -149,11 +149,13 @@ def test_a_file_that_is_not_there_is_an_answer(tmp_path):
 def test_velocity_and_acceleration_never_jump():
     keys = "time_s,x_cm,z_cm\n0,0,0\n1,0,20\n3,30,20\n4,30,0\n"
     jerk = np.diff(moved(keys).track.translation_m.astype(float), 3, axis=0) * FPS**3
-    assert np.abs(jerk).max() < 60 * 0.2 * 1.05  # of least jerk, 60 way / time**3; at constant speed it were 180
+    assert (
+        np.abs(jerk).max() < 60 * 0.2 * 1.05
+    )  # minimum jerk is 60 distance / time**3; constant speed between keys gives 180
 
 
 @pytest.mark.parametrize(("column", "end"), [("z_m", "0.1,1"), ("rz_deg", "0.5,720"), ("z_cm", "0.3,45")])
-def test_a_step_that_is_too_fast_is_taken_in_the_time_the_answer_names(column, end):
+def test_a_step_that_is_too_fast_is_accepted_with_the_duration_of_the_remedy(column, end):
     with pytest.raises(BadInput) as error:
         moved(f"time_s,{column}\n0,0\n{end}\n")
     seconds = re.findall(r"' ([\d.]+) s or more", str(error.value))[0]
@@ -161,10 +163,10 @@ def test_a_step_that_is_too_fast_is_taken_in_the_time_the_answer_names(column, e
     assert path.track.n_frames == round(float(seconds) * FPS) + 1
 
 
-def test_an_object_whose_own_z_is_not_up_begins_as_it_stands_and_is_lifted_from_there():
+def test_an_object_whose_z_axis_is_not_up_starts_as_it_stands():
     standing = rotvec_to_rotmat(np.array([np.pi / 2, 0, 0]))  # its y is up
     path = moved("time_s,z_cm,rz_deg\n0,0,0\n1,10,0\n3,10,90\n", standing=standing)
-    assert heights(path)[0] == pytest.approx(0, abs=1e-3)  # of the base; the lid is part of what stands
+    assert heights(path)[0] == pytest.approx(0, abs=1e-3)  # of the base; the bounding box includes the lid
     assert heights(path)[-1] == pytest.approx(0.10, abs=1e-3)
     first, last = rotvec_to_rotmat(path.track.rotvec[[0, -1]].astype(float))
     assert first == pytest.approx(standing, abs=1e-6)

@@ -1,4 +1,4 @@
-"""The parts of the solver, each against an independent formula."""
+"""The parts of the solvers against independent formulas."""
 
 import numpy as np
 import pytest
@@ -8,10 +8,10 @@ from hoidata.clips.clip import ObjectTrack
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandKinematics, load_embedded_hands
 from hoidata.refinement.banded import acceleration_equations, second_differences, solve_blocks
-from hoidata.refinement.hold_solver import Draw, SolverSettings, Wishes
+from hoidata.refinement.grasp_solver import Attraction, GraspObjective, SolverSettings
 from hoidata.refinement.kernels import N_UNKNOWNS, add_squares
 from hoidata.refinement.object_field import ObjectField
-from hoidata.refinement.skin import HandPose, Skin
+from hoidata.refinement.skin import HandPose, SkinnedHand
 from tests.builders.objects import hinged_box, igl_signed_m
 
 FRAMES = 3
@@ -20,118 +20,132 @@ IDS = np.array([0, 5, 100, 317, 445, 556, 673, 745, 760])
 
 def any_pose(seed: int = 0, frames: int = FRAMES) -> HandPose:
     random = np.random.default_rng(seed)
-    turn = rotvec_to_rotmat(random.normal(size=(frames, 3)))
-    return HandPose(random.normal(size=(frames, 3)), turn, random.normal(0, 0.5, (frames, 15, 3)))
+    rotation = rotvec_to_rotmat(random.normal(size=(frames, 3)))
+    return HandPose(random.normal(size=(frames, 3)), rotation, random.normal(0, 0.5, (frames, 15, 3)))
 
 
 def kinematics_vertices(pose: HandPose, betas: np.ndarray, template_m: np.ndarray) -> np.ndarray:
     """The same hand by the project's torch kinematics."""
     layer = HandKinematics(load_embedded_hands().left, torch.float64)
-    turns = np.concatenate((pose.orient[:, None], rotvec_to_rotmat(pose.fingers)), 1)
-    arrays = (pose.wrist_m, turns, betas[None], template_m)
+    rotmats = np.concatenate((pose.orient[:, None], rotvec_to_rotmat(pose.fingers)), 1)
+    arrays = (pose.wrist_m, rotmats, betas[None], template_m)
     return layer(*(torch.from_numpy(array) for array in arrays))[0].numpy()
 
 
 @pytest.mark.slow
-def test_vertices_and_their_derivatives_are_those_of_the_hand_model_with_shape_mesh_and_pose_correctives():
+def test_vertices_and_derivatives_equal_those_of_the_hand_model():
     random, model = np.random.default_rng(1), load_embedded_hands().left
     betas, template = random.normal(size=10), model.template_m + random.normal(0, 0.001, (778, 3))
-    skin, pose = Skin(model, betas, template, IDS), any_pose()
+    skin, pose = SkinnedHand(model, betas, template, IDS), any_pose()
     chain = skin.chain(pose, slopes=True)
     assert skin.vertices_m(chain) == pytest.approx(kinematics_vertices(pose, betas, template)[:, IDS], abs=1e-12)
     derivative, step = skin.all_derivatives(chain).reshape(FRAMES, len(IDS), 3, N_UNKNOWNS), 1e-6
     for unknown in range(N_UNKNOWNS):
-        way = np.zeros((FRAMES, N_UNKNOWNS))
-        way[:, unknown] = step
-        ahead, behind = (kinematics_vertices(pose.moved(sign * way), betas, template)[:, IDS] for sign in (1, -1))
+        direction = np.zeros((FRAMES, N_UNKNOWNS))
+        direction[:, unknown] = step
+        ahead, behind = (kinematics_vertices(pose.moved(sign * direction), betas, template)[:, IDS] for sign in (1, -1))
         assert derivative[..., unknown] == pytest.approx((ahead - behind) / (2 * step), abs=1e-8)
 
 
 @pytest.mark.slow
-def test_the_field_has_the_distances_of_both_parts_where_they_are_and_their_slope():
+def test_the_field_has_the_distances_of_both_posed_parts_and_their_gradient():
     model, random = hinged_box(), np.random.default_rng(2)
-    turn, place = random.normal(size=(2, FRAMES, 3)).astype(np.float32)
-    thing = ObjectTrack(model, turn, place, np.array([0.0, -0.5, -1.2], np.float32))
-    places = thing.world_from_object @ random.uniform(-0.06, 0.06, (FRAMES, 200, 3))
-    distance, slope = ObjectField(thing).distances(places)
+    rotvec, position_m = random.normal(size=(2, FRAMES, 3)).astype(np.float32)
+    object_track = ObjectTrack(model, rotvec, position_m, np.array([0.0, -0.5, -1.2], np.float32))
+    points_m = object_track.world_from_object @ random.uniform(-0.06, 0.06, (FRAMES, 200, 3))
+    distance, slope = ObjectField(object_track).distances(points_m)
     for frame in range(FRAMES):
-        vertices = thing.take(slice(frame, frame + 1)).points_in_world(model.vertices_m, model.part)[0]
-        each = [igl_signed_m(vertices, model.faces_of(part), places[frame]) for part in (0, 1)]
-        exact = np.min(each, axis=0)
-        near = exact < 0.01  # beyond the grid the way to its rim is added
+        vertices = object_track.take(slice(frame, frame + 1)).points_in_world(model.vertices_m, model.part)[0]
+        by_part = [igl_signed_m(vertices, model.faces_of(part), points_m[frame]) for part in (0, 1)]
+        exact = np.min(by_part, axis=0)
+        near = exact < 0.01  # outside of the grid the distance is approximate
         assert near.sum() > 100
         assert distance[frame, near] == pytest.approx(exact[near], abs=0.0015)
     ahead, behind = (
-        np.stack([ObjectField(thing).distances(places + step * np.eye(3)[axis])[0] for axis in range(3)], -1)
+        np.stack([ObjectField(object_track).distances(points_m + step * np.eye(3)[axis])[0] for axis in range(3)], -1)
         for step in (1e-6, -1e-6)
     )
     assert np.median(np.abs(slope - (ahead - behind) / 2e-6)) < 1e-6
-    assert np.mean(np.abs(slope - (ahead - behind) / 2e-6).max(axis=-1) < 1e-3) > 0.98  # all but at edges of cells
-    some, _ = ObjectField(thing).distances(places[[2, 0]], np.array([2, 0]))
-    assert np.array_equal(some, distance[[2, 0]])
+    assert np.mean(np.abs(slope - (ahead - behind) / 2e-6).max(axis=-1) < 1e-3) > 0.98  # except at cell boundaries
+    chosen, _ = ObjectField(object_track).distances(points_m[[2, 0]], np.array([2, 0]))
+    assert np.array_equal(chosen, distance[[2, 0]])
 
 
-def test_the_banded_system_is_the_dense_one_of_the_same_residuals():
-    random, frames, rows, n = np.random.default_rng(3), 6, 7, 4
-    derivative = random.normal(size=(frames, rows, n))
+def test_the_banded_system_equals_the_dense_one():
+    random, frames, values, n = np.random.default_rng(3), 6, 7, 4
+    derivative = random.normal(size=(frames, values, n))
     weight = np.concatenate(([0, 0], random.uniform(1, 2, frames - 2)))
-    weight[4] = 0  # a gap ties nothing
-    value = random.normal(size=(frames, rows))
-    stacked = np.zeros((frames, rows, frames, n))
+    weight[4] = 0  # a gap has no residual
+    value = random.normal(size=(frames, values))
+    stacked = np.zeros((frames, values, frames, n))
     for frame in range(2, frames):
         for back, factor in enumerate((1, -2, 1)):
             stacked[frame, :, frame - back] = factor * derivative[frame - back]
-    dense = stacked.reshape(frames * rows, frames * n)
-    heavy = np.repeat(weight, rows)
+    dense = stacked.reshape(frames * values, frames * n)
+    heavy = np.repeat(weight, values)
     matrix = dense.T @ (heavy[:, None] * dense) + np.eye(frames * n)
     difference = second_differences(value)
     vector = -dense.T @ (heavy * difference.ravel())
-    blocks, own = acceleration_equations(derivative, difference, weight)
+    blocks, actual = acceleration_equations(derivative, difference, weight)
     blocks[0] = blocks[0] + np.eye(n)
-    assert own.ravel() == pytest.approx(vector)
-    assert solve_blocks(blocks, own).ravel() == pytest.approx(np.linalg.solve(matrix, vector))
+    assert actual.ravel() == pytest.approx(vector)
+    assert solve_blocks(blocks, actual).ravel() == pytest.approx(np.linalg.solve(matrix, vector))
 
 
-@pytest.mark.parametrize("held", [None, 0, 1])
-def test_the_step_of_a_hand_goes_down_its_cost(held):
-    """Minus half the slope of what is left to wish for, the hand partly in both parts of a hinged box."""
+@pytest.mark.parametrize("part", [None, 0, 1])
+def test_the_vector_of_the_grasp_objective_is_minus_half_the_gradient_of_its_cost(part):
+    """The vector is minus half the gradient of the cost; the hand is partly in both parts of a hinged box."""
     model, hand = hinged_box(), load_embedded_hands().right
     still = np.zeros((FRAMES, 3), np.float32)
-    thing = ObjectTrack(model, still, still, np.linspace(0, -0.6, FRAMES, dtype=np.float32))
-    skin = Skin(hand, np.zeros(10), None)
+    object_track = ObjectTrack(model, still, still, np.linspace(0, -0.6, FRAMES, dtype=np.float32))
+    skin = SkinnedHand(hand, np.zeros(10), None)
     flat = HandPose(np.zeros((1, 3)), np.eye(3)[None], hand.mean_pose.reshape(1, 15, 3).astype(np.float64))
-    middle = skin.vertices_m(skin.chain(flat))[0].mean(axis=0)
-    own = flat._replace(wrist_m=np.array([[0.013, -0.007, 0.021]]) - middle).taken(np.zeros(FRAMES, int))
-    holding = np.array([True, True, False])
-    passed = None if held is None else np.array([False, True, False])
-    given = skin, ObjectField(thing), own, np.arange(FRAMES), holding, None, SolverSettings(), Draw(0.01)
-    wishes = Wishes(*given, held or 0, passed)
-    near = wishes.start.passing_m < SolverSettings().clear_m
-    assert near.any(axis=1).tolist() == [False, held is not None, False]
-    vector, step = wishes.equations(wishes.start)[1], 1e-7
-    way = np.eye(N_UNKNOWNS)[:6] * step
+    centre = skin.vertices_m(skin.chain(flat))[0].mean(axis=0)
+    hands = flat._replace(wrist_m=np.array([[0.013, -0.007, 0.021]]) - centre).taken(np.zeros(FRAMES, int))
+    in_grasp = np.array([True, True, False])
+    passed = None if part is None else np.array([False, True, False])
+    arguments = (
+        skin,
+        ObjectField(object_track),
+        hands,
+        np.arange(FRAMES),
+        in_grasp,
+        None,
+        SolverSettings(),
+        Attraction(0.01),
+    )
+    objective = GraspObjective(*arguments, part or 0, passed)
+    near = objective.start.passing_m < SolverSettings().clear_m
+    assert near.any(axis=1).tolist() == [False, part is not None, False]
+    vector, step = objective.equations(objective.start)[1], 1e-7
+    directions = np.eye(N_UNKNOWNS)[:6] * step
     ahead, behind = (
-        np.stack([wishes.costs(wishes.see(np.tile(sign * own, (FRAMES, 1)))) for own in way], 1) for sign in (1, -1)
+        np.stack(
+            [objective.costs(objective.evaluate(np.tile(sign * direction, (FRAMES, 1)))) for direction in directions], 1
+        )
+        for sign in (1, -1)
     )
     slope = (ahead - behind) / (2 * step)
     assert np.abs(vector[:, :6] + slope / 2).max() < 0.03 * np.abs(slope).max()
 
 
-def test_squares_of_scattered_residuals_add_up_as_their_products_do():
+def test_scattered_squares_equal_matrix_products():
     random, pairs = np.random.default_rng(4), 20
     frame, slope = random.integers(0, 2, pairs), random.normal(size=(pairs, 3))
     derivative, weight = random.normal(size=(pairs, 3, N_UNKNOWNS)), random.uniform(size=pairs)
-    miss = random.normal(size=pairs)
+    residual = random.normal(size=pairs)
     matrix, vector = np.zeros((2, N_UNKNOWNS, N_UNKNOWNS)), np.zeros((2, N_UNKNOWNS))
-    add_squares(frame, slope, derivative, weight, miss, matrix, vector)
-    row = np.einsum("pa,pan->pn", slope, derivative)
-    for one in range(2):
-        own = frame == one
-        assert np.tril(matrix[one]) == pytest.approx(np.tril((row[own].T * weight[own]) @ row[own]))
-        assert vector[one] == pytest.approx(-row[own].T @ (weight[own] * miss[own]))
+    add_squares(frame, slope, derivative, weight, residual, matrix, vector)
+    gradient = np.einsum("pa,pan->pn", slope, derivative)
+    for index in range(2):
+        in_frame = frame == index
+        assert np.tril(matrix[index]) == pytest.approx(
+            np.tril((gradient[in_frame].T * weight[in_frame]) @ gradient[in_frame])
+        )
+        assert vector[index] == pytest.approx(-gradient[in_frame].T @ (weight[in_frame] * residual[in_frame]))
 
 
-def test_the_step_between_two_finger_poses_on_either_side_of_pi_is_the_short_one() -> None:
+def test_the_step_between_finger_poses_on_both_sides_of_pi_is_the_short_one() -> None:
     """Stored rotations are at most pi, so 179 degrees may be followed by -179: 2 degrees apart, not 358."""
     before, after = any_pose(), any_pose()
     before.fingers[:, 4], after.fingers[:, 4] = np.deg2rad((0, 0, 179.0)), np.deg2rad((0, 0, -179.0))

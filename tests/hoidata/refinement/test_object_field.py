@@ -1,4 +1,4 @@
-"""Distances that a hold reads from a grid, on things that are thin or long."""
+"""Signed distances of the refinement's grids, for thin and long objects."""
 
 import numpy as np
 import pytest
@@ -12,17 +12,19 @@ STILL = np.zeros((1, 3), np.float32)
 
 @pytest.mark.parametrize("sizes_m", [(0.3, 0.2, 0.003), (1.4, 0.025, 0.025), (0.06, 0.06, 0.06), (2.0, 0.5, 0.02)])
 def test_distances_of_any_proportions(sizes_m):
-    """Above a face the distance is the height; inside it is negative."""
+    """Above a face the distance is the height; inside the distance is negative."""
     field = ObjectField(ObjectTrack(box_model(sizes_m), STILL, STILL))
     heights = np.array([-0.5 * sizes_m[2], 0.002, 0.006])
-    places = np.stack((0.31 * sizes_m[0] + 0 * heights, 0.1 * sizes_m[1] + 0 * heights, 0.5 * sizes_m[2] + heights), 1)
-    distance = field.distances(places[None])[0][0]
+    points_m = np.stack(
+        (0.31 * sizes_m[0] + 0 * heights, 0.1 * sizes_m[1] + 0 * heights, 0.5 * sizes_m[2] + heights), 1
+    )
+    distance = field.distances(points_m[None])[0][0]
     np.testing.assert_allclose(distance[1:], heights[1:], atol=0.001)
     assert distance[0] < 0
     assert 0 < field.most_depth_m(0) <= 0.5 * min(sizes_m)
 
 
-def test_how_deep_a_place_can_lie_is_told_of_each_part():
+def test_each_part_has_its_largest_depth():
     base, lid = box_model((0.1, 0.1, 0.1)), box_model((0.1, 0.1, 0.01))
     model = two_parts(base, lid, (0, 1, 0))
     field = ObjectField(ObjectTrack(model, STILL, STILL, np.zeros(1, np.float32)))

@@ -1,4 +1,4 @@
-"""Hands come back from their keypoints, leave the object, keep touching it, and stay what was generated elsewhere."""
+"""Fitted hands reproduce their keypoints; refined hands are on the surface and near the keypoints elsewhere."""
 
 from dataclasses import replace
 
@@ -30,17 +30,17 @@ def skin(side: Side, track: HandTrack) -> np.ndarray:
 
 
 def touching(frames: int = FRAMES, seed: int = 0) -> dict[Side, GeneratedHand]:
-    """Both hands, one flat on each half of the box's upper side: they come from 8 cm above and sink in by 12 mm."""
+    """Both hands come from 8 cm above and sink 12 mm into the top of a box, one into each half."""
     hands, random = {}, np.random.default_rng(seed)
-    for row, side in enumerate(SIDES):
+    for index, side in enumerate(SIDES):
         pose = np.tile(PAIR[side].mean_pose.astype(np.float32), (frames, 1))
         valid, still = np.ones(frames, bool), np.zeros((frames, 3), np.float32)
-        still_hand = skin(side, HandTrack(still, still, pose, BETAS[row][None], valid))
-        middle, lowest = still_hand[0].mean(axis=0), still_hand[0, :, 2].min()
-        way = np.interp(np.arange(frames), [0, 10, frames], [0.08, -DEPTH_M, -DEPTH_M])
-        shift = np.stack((0 * way + (row - 0.5) * 0.15, 0 * way, 0.05 + way - lowest), axis=1)
-        moved = still_hand - [*middle[:2], 0] + shift[:, None]
-        keypoints = moved[:, IDS] + random.normal(0, SHAKE_M, (frames, 1, 3))
+        still_hand = skin(side, HandTrack(still, still, pose, betas=BETAS[index][None], valid=valid))
+        centre, lowest = still_hand[0].mean(axis=0), still_hand[0, :, 2].min()
+        height_m = np.interp(np.arange(frames), [0, 10, frames], [0.08, -DEPTH_M, -DEPTH_M])
+        shift = np.stack((0 * height_m + (index - 0.5) * 0.15, 0 * height_m, 0.05 + height_m - lowest), axis=1)
+        vertices_m = still_hand - [*centre[:2], 0] + shift[:, None]
+        keypoints = vertices_m[:, IDS] + random.normal(0, SHAKE_M, (frames, 1, 3))
         to_object = np.zeros_like(keypoints)
         to_object[..., 2] = 0.05 - keypoints[..., 2]
         hands[side] = GeneratedHand(keypoints, to_object, valid)
@@ -55,68 +55,68 @@ def scene() -> dict[str, dict]:
 
 
 def refined(generated: dict, fitted: dict, model: ObjectModel = BOX, **settings) -> dict[Side, HandTrack]:
-    thing = still_object(model, len(generated["left"].is_active))
-    return refine_hands(PAIR, IDS, generated, fitted, thing, RefinementSettings(**settings))
+    object_track = still_object(model, len(generated["left"].is_active))
+    return refine_hands(PAIR, IDS, generated, fitted, object_track, RefinementSettings(**settings))
 
 
 def depth_mm(tracks: dict[Side, HandTrack], model: ObjectModel = BOX) -> np.ndarray:
-    """(side, frame) of the deepest vertex, exact; negative outside."""
+    """(side, frame) exact depth of the deepest vertex; negative outside."""
     index = surface_index(model)
     return np.stack([-1000 * index.nearest(skin(side, tracks[side]), None).distance_m.min(axis=1) for side in SIDES])
 
 
-def test_a_known_motion_comes_back_from_its_keypoints():
+def test_a_motion_is_recovered_from_its_keypoints():
     random, truth, generated = np.random.default_rng(1), {}, {}
-    for row, side in enumerate(SIDES):
+    for index, side in enumerate(SIDES):
         fingers = PAIR[side].mean_pose.reshape(15, 3) * np.linspace(0, 2, 10)[:, None, None]
-        turn = rotvec_to_rotmat(random.normal(0, 2, (10, 3)))
-        pose = HandPose(random.normal(0, 1, (10, 3)), turn, fingers + random.normal(0, 0.1, fingers.shape))
-        truth[side] = pose.track(BETAS[row], np.ones(10, bool), None)
+        rotation = rotvec_to_rotmat(random.normal(0, 2, (10, 3)))
+        pose = HandPose(random.normal(0, 1, (10, 3)), rotation, fingers + random.normal(0, 0.1, fingers.shape))
+        truth[side] = pose.track(BETAS[index], np.ones(10, bool), None)
         keypoints = skin(side, truth[side])[:, IDS]
         generated[side] = GeneratedHand(keypoints, np.zeros_like(keypoints), np.ones(10, bool))
     fitted = fit_hands(PAIR, BETAS, IDS, generated)
     for side in SIDES:
-        off = np.linalg.norm(skin(side, fitted[side]) - skin(side, truth[side]), axis=-1)
-        assert np.sqrt((off**2).mean()) < 0.0005
+        error_m = np.linalg.norm(skin(side, fitted[side]) - skin(side, truth[side]), axis=-1)
+        assert np.sqrt((error_m**2).mean()) < 0.0005
         assert np.abs(fitted[side].wrist_m - truth[side].wrist_m).max() < 0.001
 
 
-def test_a_frame_without_the_hand_is_not_valid_and_holds_finite_numbers():
+def test_a_frame_without_the_hand_is_invalid_and_has_finite_numbers():
     generated = touching()["left"]
     generated.keypoints_m[5:9] = np.nan
     fitted = fit_hands(PAIR, BETAS, IDS, {"left": generated})
     assert np.array_equal(np.flatnonzero(~fitted["left"].valid), range(5, 9))
-    both = refine_hands(PAIR, IDS, {"left": generated}, fitted, still_object(BOX, FRAMES))["left"]
-    assert np.isfinite(skin("left", both)).all()
-    assert np.array_equal(both.valid, fitted["left"].valid)
+    track = refine_hands(PAIR, IDS, {"left": generated}, fitted, still_object(BOX, FRAMES))["left"]
+    assert np.isfinite(skin("left", track)).all()
+    assert np.array_equal(track.valid, fitted["left"].valid)
 
 
-def test_hands_leave_the_object_and_keep_touching_it(scene):
+def test_refined_hands_are_outside_of_the_object_and_touch_it(scene):
     before, after = depth_mm(scene["fitted"]), depth_mm(scene["refined"])
     assert before.max() > 10
     assert after.max() < 3
-    assert after[:, 12:].min() > -2  # within 2 mm of the surface in every frame in which they were in it
+    assert after[:, 12:].min() > -2  # within 2 mm of the surface in all frames in which the generated hand is inside
 
 
-def test_one_thread_of_blas_solves_whatever_the_user_set(scene, monkeypatch):
+def test_refinement_uses_one_blas_thread(scene, monkeypatch):
     def watched(*arguments):
         threads.append(max(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"))
         return solve_damped(*arguments)
 
     threads: list[int] = []
-    monkeypatch.setattr("hoidata.refinement.refining.solve_damped", watched)
+    monkeypatch.setattr("hoidata.refinement.banded.solve_damped", watched)
     with threadpool_limits(2, user_api="blas"):
         refined(scene["generated"], scene["fitted"], steps=1)
     assert set(threads) == {1}
 
 
-def test_hands_stay_what_was_generated_where_nothing_is_wrong(scene):
+def test_hands_without_errors_stay_at_the_generated_keypoints(scene):
     for side in SIDES:
-        off = skin(side, scene["refined"][side])[:7, IDS] - scene["generated"][side].keypoints_m[:7]
-        assert np.sqrt((off**2).sum(-1).mean()) < 0.002
+        error_m = skin(side, scene["refined"][side])[:7, IDS] - scene["generated"][side].keypoints_m[:7]
+        assert np.sqrt((error_m**2).sum(-1).mean()) < 0.002
 
 
-def test_shaking_goes_and_the_motion_stays(scene):
+def test_noise_is_smoothed(scene):
     def acceleration(tracks: dict[Side, HandTrack]) -> float:
         return float(np.mean([np.abs(np.diff(skin(side, tracks[side])[12:], 2, axis=0)).mean() for side in SIDES]))
 
@@ -125,19 +125,19 @@ def test_shaking_goes_and_the_motion_stays(scene):
 
 def test_shape_and_validity_are_kept_and_the_same_input_gives_the_same_bytes(scene):
     again = refined(scene["generated"], fit_hands(PAIR, BETAS, IDS, scene["generated"]))
-    for row, side in enumerate(SIDES):
+    for index, side in enumerate(SIDES):
         track = scene["refined"][side]
-        assert np.array_equal(track.betas, BETAS[row][None].astype(np.float32))
+        assert np.array_equal(track.betas, BETAS[index][None].astype(np.float32))
         assert all(np.array_equal(getattr(track, name), getattr(again[side], name)) for name in track.PER_FRAME)
 
 
-def test_a_hand_that_takes_no_part_is_not_pushed_out(scene):
+def test_an_inactive_hand_is_not_moved_out_of_the_object(scene):
     idle = {side: replace(hand, is_active=np.zeros(FRAMES, bool)) for side, hand in scene["generated"].items()}
     assert depth_mm(refined(idle, scene["fitted"]))[:, 14:].min() > 8
 
 
 @pytest.mark.slow
-def test_how_a_surface_is_cut_into_triangles_changes_nothing(scene):
+def test_the_triangulation_of_the_object_has_no_effect(scene):
     mesh = BOX
     for _ in range(4):
         mesh = _quartered(mesh)
@@ -152,62 +152,63 @@ def _quartered(model: ObjectModel) -> ObjectModel:
     middles = (corners + np.roll(corners, -1, axis=1)) / 2
     a, b, c = corners.swapaxes(0, 1)
     ab, bc, ca = middles.swapaxes(0, 1)
-    faces = np.concatenate([np.stack(own, axis=1) for own in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+    quarters = (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
+    faces = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
     return ObjectModel("box", faces.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), np.zeros(3 * len(faces)))
 
 
 @pytest.mark.slow
-def test_the_beginning_of_a_motion_is_refined_as_if_its_end_were_not_there(scene):
+def test_the_start_of_a_motion_does_not_depend_on_its_length(scene):
     longer = {
         side: GeneratedHand(
             *(np.concatenate((a, a[-1:].repeat(40, axis=0))) for a in (h.keypoints_m, h.to_object_m, h.is_active))
         )
         for side, h in scene["generated"].items()
     }
-    found = refined(longer, fit_hands(PAIR, BETAS, IDS, longer))
+    tracks = refined(longer, fit_hands(PAIR, BETAS, IDS, longer))
     for side in SIDES:
-        assert np.abs(skin(side, found[side])[:12] - skin(side, scene["refined"][side])[:12]).max() < 5e-4
+        assert np.abs(skin(side, tracks[side])[:12] - skin(side, scene["refined"][side])[:12]).max() < 5e-4
 
 
-def test_a_mesh_without_an_inside_is_touched_and_not_pushed_from(scene):
+def test_refinement_against_a_mesh_without_an_inside_is_finite(scene):
     sheet = replace(BOX, faces=BOX.faces[:-4])
-    found = refined(scene["generated"], scene["fitted"], sheet)
-    assert all(np.isfinite(skin(side, found[side])).all() for side in SIDES)
+    tracks = refined(scene["generated"], scene["fitted"], sheet)
+    assert all(np.isfinite(skin(side, tracks[side])).all() for side in SIDES)
 
 
 @pytest.mark.slow
-def test_a_hand_moves_with_an_object_that_carries_it(scene):
-    place = np.tile(np.float32([1.0, 2.0, 3.0]), (FRAMES, 1))
-    turn = np.tile(np.float32([0.3, -0.4, 1.2]), (FRAMES, 1))
-    thing = ObjectTrack(BOX, turn, place)
-    world = thing.world_from_object
+def test_refined_hands_move_with_the_world_frame(scene):
+    position_m = np.tile(np.float32([1.0, 2.0, 3.0]), (FRAMES, 1))
+    rotvec = np.tile(np.float32([0.3, -0.4, 1.2]), (FRAMES, 1))
+    object_track = ObjectTrack(BOX, rotvec, position_m)
+    world = object_track.world_from_object
     carried = {
         side: GeneratedHand(world @ h.keypoints_m, world.turn(h.to_object_m), h.is_active)
         for side, h in scene["generated"].items()
     }
-    found = refine_hands(PAIR, IDS, carried, fit_hands(PAIR, BETAS, IDS, carried), thing)
+    tracks = refine_hands(PAIR, IDS, carried, fit_hands(PAIR, BETAS, IDS, carried), object_track)
     for side in SIDES:
-        here = world @ skin(side, scene["refined"][side])
-        assert np.abs(skin(side, found[side]) - here).max() < 2e-4
+        expected = world @ skin(side, scene["refined"][side])
+        assert np.abs(skin(side, tracks[side]) - expected).max() < 2e-4
 
 
-def test_arrays_that_do_not_fit_each_other_are_an_answer(scene):
+def test_inconsistent_arrays_are_refused(scene):
     generated, fitted = scene["generated"], scene["fitted"]
     with pytest.raises(BadInput, match="equally many frames"):
         refine_hands(PAIR, IDS, generated, fitted, still_object(BOX, FRAMES + 1))
     with pytest.raises(BadInput, match="check the caller"):
         fit_hands(PAIR, BETAS, IDS[:-1], generated)
     nowhere = replace(generated["left"], keypoints_m=np.full((FRAMES, len(IDS), 3), np.nan))
-    with pytest.raises(BadInput, match="leave this hand out"):
+    with pytest.raises(BadInput, match="omit this hand"):
         fit_hands(PAIR, BETAS, IDS, {"left": nowhere})
 
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
-def test_a_step_that_is_no_number_is_never_taken(scene, monkeypatch):
-    """A solver that diverges at once leaves the hands as they were fitted, however often it is asked."""
+def test_a_step_that_is_nan_is_rejected(scene, monkeypatch):
+    """A solver that diverges immediately returns the fitted hands."""
     monkeypatch.setattr(
-        "hoidata.refinement.refining.solve_damped", lambda blocks, vector, damping: np.full_like(vector, np.nan)
+        "hoidata.refinement.banded.solve_damped", lambda blocks, vector, damping: np.full_like(vector, np.nan)
     )
-    found = refined(scene["generated"], scene["fitted"])
+    tracks = refined(scene["generated"], scene["fitted"])
     for side in SIDES:
-        np.testing.assert_allclose(skin(side, found[side]), skin(side, scene["fitted"][side]), atol=1e-6)
+        np.testing.assert_allclose(skin(side, tracks[side]), skin(side, scene["fitted"][side]), atol=1e-6)

@@ -1,4 +1,4 @@
-"""MANO-layout hands to sense with: their joints, tips and skin are those of the hand model."""
+"""MANO-layout hands as tracked hands: joints, tips and skin equal those of the hand model."""
 
 from types import SimpleNamespace
 
@@ -28,18 +28,18 @@ def track(frames: int = 7, template_m: np.ndarray | None = None) -> SimpleNamesp
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize("personal", [False, True])
 def test_joints_tips_sensors_and_capsules_are_those_of_the_model(side, personal):
-    moved = track(template_m=HANDS[side].template_m * 1.1 if personal else None)
-    hand = mano_hand(HANDS, side, moved.betas[0], moved.template_m)
-    rotmats = track_rotmats(moved)
+    hand_track = track(template_m=HANDS[side].template_m * 1.1 if personal else None)
+    hand = mano_hand(HANDS, side, hand_track.betas[0], hand_track.template_m)
+    rotmats = track_rotmats(hand_track)
     fingers = rotmats[:, 1:]
-    found = hand.state(fingers).placed(RigidTransform(rotmats[:, 0], moved.wrist_m))
-    vertices = track_vertices(moved, HANDS[side])
-    np.testing.assert_allclose(found.joint_m, track_joints(moved, HANDS[side])[:, :16], atol=1e-6)
-    np.testing.assert_allclose(found.tip_m, vertices[:, list(TIP_VERTICES)], atol=1e-6)
-    np.testing.assert_allclose(found.sensor_m, vertices[:, list(sensor_vertices(HANDS.right))], atol=1e-6)
-    np.testing.assert_allclose(found.capsule_end_m, hand_capsules(moved, HANDS[side]).end_m, atol=1e-6)
-    np.testing.assert_allclose(hand.finger_rotmats(found.joint_rotmats), fingers, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(found.sensor_normal, axis=-1), 1)
+    state = hand.state(fingers).placed(RigidTransform(rotmats[:, 0], hand_track.wrist_m))
+    vertices = track_vertices(hand_track, HANDS[side])
+    np.testing.assert_allclose(state.joint_m, track_joints(hand_track, HANDS[side])[:, :16], atol=1e-6)
+    np.testing.assert_allclose(state.tip_m, vertices[:, list(TIP_VERTICES)], atol=1e-6)
+    np.testing.assert_allclose(state.sensor_m, vertices[:, list(sensor_vertices(HANDS.right))], atol=1e-6)
+    np.testing.assert_allclose(state.capsule_end_m, hand_capsules(hand_track, HANDS[side]).end_m, atol=1e-6)
+    np.testing.assert_allclose(hand.finger_rotmats(state.joint_rotmats), fingers, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(state.sensor_normal, axis=-1), 1)
 
 
 def test_the_left_hand_of_the_embedded_pair_is_the_right_one_in_a_mirror():
@@ -51,15 +51,15 @@ def test_the_left_hand_of_the_embedded_pair_is_the_right_one_in_a_mirror():
     assert (mirrored.side, mirrored.mirrored().side) == ("left", "right")
 
 
-def test_104_sensors_look_out_of_the_palm_side_of_every_finger_and_keep_apart():
+def test_104_sensors_face_out_of_the_palm_side_of_each_finger_and_are_apart():
     hand = mano_hand(HANDS, "right")
     assert len(set(sensor_vertices(HANDS.right))) == hand.n_sensors == N_SENSORS
-    owner, places = hand.skin.weight[5:].argmax(axis=1), hand.skin.point_m[5:]
-    on_thumb = owner >= 13
-    assert set(owner[~on_thumb]) == set(range(13))
+    segment, positions = hand.skin.weight[5:].argmax(axis=1), hand.skin.point_m[5:]
+    on_thumb = segment >= 13
+    assert set(segment[~on_thumb]) == set(range(13))
     assert on_thumb.sum() >= 8
     assert ((hand.skin.normal[5:] @ canonical_axes(HANDS.right))[~on_thumb, 2] < -0.8).all()
-    apart = np.linalg.norm(places[:, None] - places, axis=-1) + np.eye(N_SENSORS)
+    apart = np.linalg.norm(positions[:, None] - positions, axis=-1) + np.eye(N_SENSORS)
     assert apart.min() > 0.004
 
 

@@ -1,4 +1,4 @@
-"""Promises of BimArt's object features and maps: the vertices a k-d tree finds, part by part, in any world and mesh."""
+"""BimArt's object features and distance maps equal k-d tree queries, for each part and in any world frame."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ COUNT = 40
 
 
 def lump(size: tuple[float, float, float], middle: tuple[float, float, float], seed: int) -> ObjectModel:
-    """A bumpy ellipsoid, so that no two vertices are equally near to anything."""
+    """A bumpy ellipsoid, so that nearest vertices are unique."""
     mesh = trimesh.creation.icosphere(2, 1.0)
     bumps = 1 + 0.1 * np.random.default_rng(seed).normal(size=(len(mesh.vertices), 1))
     mesh.vertices = mesh.vertices * bumps * size + middle
@@ -37,17 +37,18 @@ ANGLES = np.concatenate((np.linspace(-0.4, 2.0, 9), [0.0]))
 
 
 @pytest.mark.slow
-def test_vertices_are_those_of_a_tree_of_every_frame_and_part_the_moving_part_first() -> None:
+def test_nearest_vertices_equal_a_tree_query_of_each_frame_and_part_moving_part_first() -> None:
     settings = BasisSettings(COUNT, seed=3)
-    seen, scale = PartBps(BOTTLE, settings).look(ANGLES), object_scale(BOTTLE)
+    bps, scale = PartBps(BOTTLE, settings).nearest_points(ANGLES), object_scale(BOTTLE)
     placed, points = articulate(BOTTLE.vertices_m, BOTTLE.part, BOTTLE.hinge, ANGLES), settings.points()
     for frame, vertices in enumerate(placed):
-        for row, part in enumerate((1, 0)):
-            own, columns = np.flatnonzero(BOTTLE.part == part), slice(row * COUNT, (row + 1) * COUNT)
-            nearest = own[KDTree(scale * vertices[own]).query(points)[1]]
-            np.testing.assert_array_equal(seen.vertex[frame, columns], nearest)
-            np.testing.assert_allclose(seen.place_m[frame, columns], vertices[nearest], atol=1e-6)
-            np.testing.assert_allclose(seen.offset[frame, columns], scale * vertices[nearest] - points, atol=1e-5)
+        for number, part in enumerate((1, 0)):
+            part_vertices = np.flatnonzero(BOTTLE.part == part)
+            basis_points = slice(number * COUNT, (number + 1) * COUNT)
+            nearest = part_vertices[KDTree(scale * vertices[part_vertices]).query(points)[1]]
+            np.testing.assert_array_equal(bps.vertex[frame, basis_points], nearest)
+            np.testing.assert_allclose(bps.point_m[frame, basis_points], vertices[nearest], atol=1e-6)
+            np.testing.assert_allclose(bps.offset[frame, basis_points], scale * vertices[nearest] - points, atol=1e-5)
 
 
 def test_basis_points_fill_their_ball_evenly_and_come_from_the_seed() -> None:
@@ -65,64 +66,69 @@ def test_the_scale_brings_the_farthest_vertex_to_0_85_at_any_angle() -> None:
 
 
 def test_a_rigid_object_has_no_moving_part() -> None:
-    seen = PartBps(canonical_object(box_model(middle_m=(1, 2, 3)))[0], BasisSettings(COUNT)).look(np.zeros(2))
-    np.testing.assert_array_equal(seen.there, np.arange(2 * COUNT) >= COUNT)
-    assert not seen.offset[:, :COUNT].any()
-    assert seen.offset[:, COUNT:].any()
+    bps = PartBps(canonical_object(box_model(middle_m=(1, 2, 3)))[0], BasisSettings(COUNT)).nearest_points(np.zeros(2))
+    np.testing.assert_array_equal(bps.is_present, np.arange(2 * COUNT) >= COUNT)
+    assert not bps.offset[:, :COUNT].any()
+    assert bps.offset[:, COUNT:].any()
 
 
-def moved(model: ObjectModel, turn: np.ndarray, shift: np.ndarray) -> ObjectModel:
+def moved(model: ObjectModel, rotation: np.ndarray, shift: np.ndarray) -> ObjectModel:
     assert model.hinge is not None
-    hinge = Hinge(turn @ model.hinge.axis, turn @ model.hinge.origin_m + shift + 0.3 * (turn @ model.hinge.axis))
-    return replace(model, vertices_m=model.vertices_m @ turn.T + shift, hinge=hinge)
+    hinge = Hinge(
+        rotation @ model.hinge.axis, rotation @ model.hinge.origin_m + shift + 0.3 * (rotation @ model.hinge.axis)
+    )
+    return replace(model, vertices_m=model.vertices_m @ rotation.T + shift, hinge=hinge)
 
 
-def test_the_canonical_object_is_the_same_however_its_mesh_lies() -> None:
-    turn, shift = rotvec_to_rotmat(np.array([0.4, -1.2, 0.7])), np.array([0.3, 0.2, -0.1])
+def test_the_canonical_object_does_not_depend_on_the_pose_of_the_mesh() -> None:
+    rotation, shift = rotvec_to_rotmat(np.array([0.4, -1.2, 0.7])), np.array([0.3, 0.2, -0.1])
     for model in (BOTTLE, two_parts(box_model(), lump((0.1, 0.05, 0.02), (0.1, 0, 0), 2), (0, 0.6, 0.8), (0.02, 0, 0))):
-        first, second = (canonical_object(own, "base")[0] for own in (model, moved(model, turn, shift)))
+        first, second = (canonical_object(variant, "base")[0] for variant in (model, moved(model, rotation, shift)))
         np.testing.assert_allclose(first.vertices_m, second.vertices_m, atol=1e-12)
     assert canonical_object(BOTTLE, "axis")[0] is BOTTLE
 
 
-def test_the_canonical_frame_has_the_hinge_along_minus_z_and_leads_back() -> None:
+def test_the_canonical_frame_has_the_hinge_along_minus_z_and_maps_back() -> None:
     model = moved(BOTTLE, rotvec_to_rotmat(np.array([2.0, 1.0, 0.3])), np.array([0.1, 0, 0]))
     for frame in ("axis", "base"):
-        made, object_from_canonical = canonical_object(model, frame)
-        assert made.hinge is not None
-        np.testing.assert_allclose(object_from_canonical @ made.vertices_m, model.vertices_m, atol=1e-12)
-        at_rest, turned = (articulate(own.vertices_m, own.part, own.hinge, np.array([0.8]))[0] for own in (model, made))
+        canonical, object_from_canonical = canonical_object(model, frame)
+        assert canonical.hinge is not None
+        np.testing.assert_allclose(object_from_canonical @ canonical.vertices_m, model.vertices_m, atol=1e-12)
+        at_rest, turned = (
+            articulate(variant.vertices_m, variant.part, variant.hinge, np.array([0.8]))[0]
+            for variant in (model, canonical)
+        )
         np.testing.assert_allclose(object_from_canonical @ turned, at_rest, atol=1e-12)
 
 
-def test_the_surface_looks_the_same_in_a_finer_mesh_and_vertices_do_not() -> None:
+def test_nearest_surface_points_are_equal_in_a_finer_mesh_and_nearest_vertices_are_not() -> None:
     coarse = trimesh.creation.box((0.1, 0.2, 0.05))
     fine = coarse.subdivide().subdivide()
     kinds: tuple[tuple[Nearest, bool], ...] = (("surface", True), ("vertex", False))
     for nearest, same in kinds:
-        seen = [
-            PartBps(model_of(mesh), BasisSettings(COUNT, nearest=nearest)).look(np.zeros(1)).offset
+        offsets = [
+            PartBps(model_of(mesh), BasisSettings(COUNT, nearest=nearest)).nearest_points(np.zeros(1)).offset
             for mesh in (coarse, fine)
         ]
-        assert np.allclose(seen[0], seen[1], atol=1e-6) == same
+        assert np.allclose(offsets[0], offsets[1], atol=1e-6) == same
 
 
-def test_the_nearest_place_of_positions_is_that_of_the_nearer_part() -> None:
+def test_the_nearest_point_is_on_the_closer_part() -> None:
     positions = np.random.default_rng(0).normal(0, 0.1, (len(ANGLES), 7, 3))
-    found = PartBps(BOTTLE, BasisSettings(4)).nearest_m(positions, ANGLES)
+    nearest = PartBps(BOTTLE, BasisSettings(4)).nearest_m(positions, ANGLES)
     for frame, vertices in enumerate(articulate(BOTTLE.vertices_m, BOTTLE.part, BOTTLE.hinge, ANGLES)):
-        np.testing.assert_allclose(found[frame], vertices[KDTree(vertices).query(positions[frame])[1]], atol=1e-12)
+        np.testing.assert_allclose(nearest[frame], vertices[KDTree(vertices).query(positions[frame])[1]], atol=1e-12)
 
 
-def test_a_map_has_the_distance_to_the_nearest_point_of_the_hand() -> None:
-    draws = np.random.default_rng(1)
-    places, hand = draws.normal(size=(3, 11, 3)), draws.normal(size=(3, 5, 3))
-    wanted = np.linalg.norm(places[:, :, None] - hand[:, None], axis=-1).min(axis=2)
-    np.testing.assert_allclose(distance_map(places, hand), wanted, rtol=1e-5)
+def test_a_distance_map_has_the_distance_to_the_nearest_point_of_the_hand() -> None:
+    rng = np.random.default_rng(1)
+    points, hand = rng.normal(size=(3, 11, 3)), rng.normal(size=(3, 5, 3))
+    expected = np.linalg.norm(points[:, :, None] - hand[:, None], axis=-1).min(axis=2)
+    np.testing.assert_allclose(distance_map(points, hand), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("count", [20, 64, 100])
-def test_keypoints_are_vertices_of_every_segment_none_twice(count: int) -> None:
+def test_keypoints_are_distinct_vertices_of_all_segments(count: int) -> None:
     model = load_embedded_hands().right
     ids = hand_keypoints(model, count)
     assert len(set(ids.tolist())) == count

@@ -21,7 +21,7 @@ from models.manipnet.features import (
     trajectory_features,
 )
 from tests.builders.objects import box_model
-from tests.builders.sensing import small_hand, turns
+from tests.builders.sensing import random_rotations, small_hand
 
 MIRROR = np.diag([-1.0, 1.0, 1.0])
 RATE = 60
@@ -63,7 +63,7 @@ HANDS = {"small": small_hand(), "mano": mano_hand(load_embedded_hands(), "right"
 @pytest.mark.parametrize("hand", HANDS.values(), ids=HANDS)
 def test_joint_rotations_are_recovered_from_the_features_of_either_hand(hand: TrackedHand):
     for one_hand in (hand, hand.mirrored()):
-        state = one_hand.state(turns(5 * (hand.n_joints - 1), 0.5, 0).reshape(5, -1, 3, 3))
+        state = one_hand.state(random_rotations(5 * (hand.n_joints - 1), 0.5, 0).reshape(5, -1, 3, 3))
         rotmats = joint_rotmats_of(one_hand, pose_features(one_hand, state))
         np.testing.assert_allclose(rotmats, state.joint_rotmats, atol=1e-12)
         noisy = pose_features(one_hand, state) + np.random.default_rng(0).normal(0, 0.1, (5, 1))
@@ -76,10 +76,10 @@ def test_joint_rotations_are_recovered_from_the_features_of_either_hand(hand: Tr
 
 def test_inputs_are_unchanged_when_the_scene_moves_or_is_mirrored_with_the_hand():
     scene, hand, time_s, settings = control(), small_hand(), np.array([0.7, 0.71, 1.3]), SETTINGS
-    poses = turns(3 * 5, 0.3, 4).reshape(3, 5, 3, 3)
+    poses = random_rotations(3 * 5, 0.3, 4).reshape(3, 5, 3, 3)
     surface = SurfaceIndex(scene.model)
     original = hand_inputs(scene, "right", hand, hand.state(poses), time_s, surface, settings)
-    rotation, translation = turns(1, 2.0, 8)[0], np.array([1.0, -2.0, 3.0])
+    rotation, translation = random_rotations(1, 2.0, 8)[0], np.array([1.0, -2.0, 3.0])
     wrists = {side: moved(motion, rotation, translation) for side, motion in scene.wrists.items()}
     moved_scene = Control(wrists, moved(scene.object_motion, rotation, translation), scene.model)
     moved_inputs = hand_inputs(moved_scene, "right", hand, hand.state(poses), time_s, surface, settings)

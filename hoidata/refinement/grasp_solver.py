@@ -1,0 +1,319 @@
+"""Correct one hand relative to the object part it grasps: one constant correction per grasp, a smooth one around it.
+
+The unknowns are control points of a uniform cubic B-spline, 51 numbers each. All control points that influence a grasp
+are one. The frames of a grasp are nearly equal, so a few represent all; the cost grows with the frames outside of
+grasps. Solved by Levenberg-Marquardt.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from hoidata.geometry.intervals import Interval
+from hoidata.physics.capsules import Capsules
+from hoidata.refinement.banded import minimize_banded
+from hoidata.refinement.kernels import N_UNKNOWNS, add_squares, lower_capsules
+from hoidata.refinement.object_field import ObjectField
+from hoidata.refinement.skin import HandPose, SkinnedHand
+
+# How far skin moves, metres, per unit of each unknown: wrist position, hand rotation, finger joints.
+_LEVER_M = np.concatenate((np.ones(3), np.full(3, 0.1), np.full(45, 0.04)))
+_METRIC_VERTICES = 16  # the deviation of a pose from the original counts as that of 16 vertices
+
+
+@dataclass(frozen=True)
+class SolverSettings:
+    """Standard deviations of the residuals (a smaller one counts more), and how the motion is sampled."""
+
+    press_m: float = 0.0015  # depth of touching skin, since skin is soft
+    surface_m: float = 0.001  # of the nearest skin of each of 16 segments of a grasping hand, from that depth
+    depth_m: float = 0.0005  # of a vertex deeper than press_m in the object or in the other hand
+    bend_m: float = 0.004  # of a control point from the mean of its neighbours
+    # Of each finger angle from the original. Without it, distant skin is attracted by impossible finger poses.
+    finger_rad: float = 0.1
+    clear_m: float = 0.012  # distance that a grasping hand keeps from a part that moves past it
+    clear_deviation_m: float = 0.004  # of a vertex closer than that
+    knot_frames: int = 5  # frames between knots of the spline
+    every: int = 2  # outside of grasps one of so many frames is evaluated
+    steps: int = 12  # largest number of steps
+    enough: float = 0.01  # stop when a step reduces the cost by less than this fraction
+
+
+@dataclass(frozen=True)
+class Attraction:
+    """How strongly skin near the surface is attracted to it."""
+
+    reach_m: float = 0.003  # skin farther away is hardly attracted (Gaussian weight)
+    keypoint_m: float = 0.006  # standard deviation of a vertex from its original position
+
+
+def spline_weights(n_frames: int, grasps: Sequence[Interval], knot_frames: int) -> np.ndarray:
+    """(frame, control point) weights that sum to 1; the control points that influence a grasp are one."""
+    intervals = max(1, round((n_frames - 1) / knot_frames))
+    first = np.minimum(np.linspace(0, intervals, n_frames).astype(int), intervals - 1)
+    u = np.linspace(0, intervals, n_frames) - first
+    basis = np.stack(((1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3), 1) / 6
+    weights = np.zeros((n_frames, intervals + 3))
+    weights[np.arange(n_frames)[:, None], first[:, None] + np.arange(4)] = basis
+    is_joined = np.zeros(intervals + 2, bool)  # with the next control point
+    for start, stop in grasps:
+        influencing = np.flatnonzero((weights[start:stop] > 1e-9).any(axis=0))
+        is_joined[influencing[0] : influencing[-1]] = True
+    number = np.append(0, np.cumsum(~is_joined))
+    return weights @ np.eye(number[-1] + 1)[number]
+
+
+class EvaluatedPose(NamedTuple):
+    """A pose and the signed distances (frame, vertex) of its skin, metres, with their gradients (frame, vertex, 3)."""
+
+    step: np.ndarray  # (frame, 51) from the original pose
+    pose: HandPose
+    distance_m: np.ndarray  # to the object
+    slope: np.ndarray
+    grasped_m: np.ndarray  # to what the hand grasps: the object, or one part while the other moves past
+    grasped_slope: np.ndarray
+    passing_m: np.ndarray  # to the part that moves past the hand, infinite otherwise
+    passing_slope: np.ndarray
+    other_m: np.ndarray  # to the other hand
+    other_slope: np.ndarray
+
+
+class GraspObjective:
+    """Cost of a hand's pose in each frame, and its normal equations; everything in the frame of the part.
+
+    Args:
+        skin: the hand's vertices.
+        field: distances to the object.
+        original: (frame,) pose before the correction.
+        frames: (frame,) index of each frame in the object's motion.
+        in_grasp: (frame,) bool.
+        other: (frame,) capsules of the other hand, if any.
+        settings: standard deviations.
+        attraction: how far skin is attracted.
+        part: the part that the hand grasps.
+        passed: (frame,) bool, the other part moves past the hand; None for never.
+    """
+
+    def __init__(
+        self,
+        skin: SkinnedHand,
+        field: ObjectField,
+        original: HandPose,
+        frames: np.ndarray,
+        in_grasp: np.ndarray,
+        other: Capsules | None,
+        settings: SolverSettings,
+        attraction: Attraction,
+        part: int = 0,
+        passed: np.ndarray | None = None,
+    ) -> None:
+        self.skin, self.field, self.original, self.frames = skin, field, original, frames
+        self.other, self.part, self.passed = other, part, passed
+        self.settings, self.attraction = settings, attraction
+        self.metric = self._metric()
+        self.start = self.evaluate(np.zeros((len(frames), N_UNKNOWNS)))
+        near = np.maximum(skin.nearest_of_segments(self.start.grasped_m)[1], 0)
+        # (frame, segment) how certain it is that the segment touches.
+        self.touch_weight = np.exp(-0.5 * (near / attraction.reach_m) ** 2) * in_grasp[:, None]
+
+    def _metric(self) -> np.ndarray:
+        """(frame, 51, 51) quadratic form of a step: squared vertex displacements in standard deviations."""
+        chain = self.skin.chain(self.original, slopes=True)
+        vertex = np.arange(0, len(self.skin.shaped_m), _METRIC_VERTICES)
+        frame = np.repeat(np.arange(len(self.frames)), len(vertex))
+        derivative = self.skin.derivatives(chain, frame, np.tile(vertex, len(self.frames)))
+        derivative = derivative.reshape(len(self.frames), -1, N_UNKNOWNS)
+        # A little of each unknown is added, since some fingers move few of the vertices.
+        metric = derivative.swapaxes(1, 2) @ derivative / len(vertex) + 1e-5 * np.eye(N_UNKNOWNS)
+        metric *= _METRIC_VERTICES / self.attraction.keypoint_m**2
+        fingers = np.arange(6, N_UNKNOWNS)
+        metric[:, fingers, fingers] += self.settings.finger_rad**-2
+        return metric
+
+    def evaluate(self, step: np.ndarray) -> EvaluatedPose:
+        """The hand after a step (frame, 51) from the original pose."""
+        pose = self.original.moved(step)
+        points = self.skin.vertices_m(self.skin.chain(pose))
+        other, passing = ((np.full(points.shape[:2], np.inf), np.zeros(points.shape)) for _ in range(2))
+        if self.other is not None:
+            lower_capsules(*self.other, points, *other)
+        if self.passed is None:
+            nearest = grasped = self.field.distances(points, self.frames)
+        else:
+            to_part, to_passer = (
+                self.field.distances_to(part, points, self.frames) for part in (self.part, 1 - self.part)
+            )
+            part_is_closer, passed = to_part[0] <= to_passer[0], self.passed[:, None]
+            nearest = (
+                np.where(part_is_closer, to_part[0], to_passer[0]),
+                np.where(part_is_closer[..., None], to_part[1], to_passer[1]),
+            )
+            grasped = np.where(passed, to_part[0], nearest[0]), np.where(passed[..., None], to_part[1], nearest[1])
+            passing = np.where(passed, to_passer[0], np.inf), to_passer[1]
+        return EvaluatedPose(step, pose, *nearest, *grasped, *passing, *other)
+
+    def costs(self, state: EvaluatedPose) -> np.ndarray:
+        """(frame,) cost of a pose."""
+        settings, step = self.settings, state.step
+        costs = ((self.metric @ step[..., None])[..., 0] * step).sum(axis=1)
+        to_touch = self.skin.nearest_of_segments(state.grasped_m)[1] + settings.press_m
+        costs += (self.touch_weight * to_touch**2).sum(axis=1) / settings.surface_m**2
+        for distance, _, least_m, deviation_m in self._obstacles(state):
+            costs += (np.minimum(distance - least_m, 0) ** 2).sum(axis=1) / deviation_m**2
+        return costs
+
+    def _obstacles(self, state: EvaluatedPose) -> list[tuple[np.ndarray, np.ndarray, float, float]]:
+        """Per obstacle: distances, gradients, least allowed distance and standard deviation, metres."""
+        settings = self.settings
+        return [
+            (state.distance_m, state.slope, -settings.press_m, settings.depth_m),
+            (state.other_m, state.other_slope, -settings.press_m, settings.depth_m),
+            (state.passing_m, state.passing_slope, settings.clear_m, settings.clear_deviation_m),
+        ]
+
+    def equations(self, state: EvaluatedPose) -> tuple[np.ndarray, np.ndarray]:
+        """Normal equations (frame, 51, 51) of the next step, and minus half the gradient (frame, 51)."""
+        matrix, vector = np.zeros_like(self.metric), np.zeros_like(state.step)
+        self._add_distances(state, matrix, vector)
+        matrix += np.tril(matrix, -1).swapaxes(1, 2) + self.metric
+        vector -= (self.metric @ state.step[..., None])[..., 0]
+        return matrix, vector
+
+    def _add_distances(self, state: EvaluatedPose, matrix: np.ndarray, vector: np.ndarray) -> None:
+        """Add the residuals of skin that should touch, and of skin beyond the least distance of an obstacle."""
+        settings, chain = self.settings, self.skin.chain(state.pose, slopes=True)
+        nearest_vertex, near = self.skin.nearest_of_segments(state.grasped_m)
+        frame, segment = np.nonzero(self.touch_weight > 1e-3)
+        vertex = nearest_vertex[frame, segment]
+        weight = self.touch_weight[frame, segment] / settings.surface_m**2
+        residuals = [(frame, vertex, near[frame, segment] + settings.press_m, weight)]
+        slopes = [state.grasped_slope[frame, vertex]]
+        for distance, slope, least_m, deviation_m in self._obstacles(state):
+            frame, vertex = np.nonzero(distance < least_m)
+            weight = np.full(len(frame), deviation_m**-2)
+            residuals.append((frame, vertex, distance[frame, vertex] - least_m, weight))
+            slopes.append(slope[frame, vertex])
+        frame, vertex, residual_m, weight = (np.concatenate(column) for column in zip(*residuals, strict=True))
+        derivative = self.skin.derivatives(chain, frame, vertex)
+        add_squares(frame, np.concatenate(slopes), derivative, weight, residual_m, matrix, vector)
+
+
+def solve_each_frame(objective: GraspObjective, steps: int) -> HandPose:
+    """The pose of each frame by itself, after ``steps`` of Levenberg-Marquardt with a damping per frame."""
+    state, damping = objective.start, np.full(len(objective.frames), 1e-3)
+    cost, diagonal = objective.costs(state), np.arange(N_UNKNOWNS)
+    for _ in range(steps):
+        matrix, vector = objective.equations(state)
+        matrix[:, diagonal, diagonal] *= 1 + damping[:, None]
+        trial = objective.evaluate(state.step + np.linalg.solve(matrix, vector[..., None])[..., 0])
+        trial_cost = objective.costs(trial)
+        is_better = trial_cost < cost
+        state = _select(is_better, trial, state)
+        cost, damping = np.where(is_better, trial_cost, cost), damping * np.where(is_better, 0.1, 10)
+    return state.pose
+
+
+def _select(chosen: np.ndarray, one: EvaluatedPose, other: EvaluatedPose) -> EvaluatedPose:
+    """In each frame ``one`` if ``chosen (frame,)``, else ``other``."""
+
+    def pick(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+    names = [name for name in EvaluatedPose._fields if name != "pose"]
+    arrays = {name: pick(getattr(one, name), getattr(other, name)) for name in names}
+    return EvaluatedPose(**arrays, pose=one.pose.where(chosen, other.pose))
+
+
+class HandMotion:
+    """A hand's motion and its spline correction; everything in the frame of the part.
+
+    The arguments that are not listed are as in ``GraspObjective``, for all frames.
+
+    Args:
+        pose: (frame,) original pose.
+        grasps: frame intervals in which the hand does not move on the part.
+        valid: (frame,) bool, the hand is tracked.
+    """
+
+    def __init__(
+        self,
+        skin: SkinnedHand,
+        field: ObjectField,
+        pose: HandPose,
+        grasps: Sequence[Interval],
+        valid: np.ndarray,
+        other: Capsules | None,
+        settings: SolverSettings,
+        attraction: Attraction,
+        part: int = 0,
+        passed: np.ndarray | None = None,
+    ) -> None:
+        self.pose, self.settings = pose, settings
+        self.all_weights = spline_weights(len(valid), grasps, settings.knot_frames)
+        per_grasp = 1 + 3 * (field.moves or other is not None)
+        frames, self.frame_weight, in_grasp = _representative_frames(grasps, valid, per_grasp, settings.every)
+        self.weights = self.all_weights[frames]
+        bend = np.diff(np.eye(self.weights.shape[1]), n=2, axis=0)
+        self.bend = bend.T @ bend / settings.bend_m**2  # of the control points' second differences
+        self.objective = GraspObjective(
+            skin,
+            field,
+            pose.taken(frames),
+            frames,
+            in_grasp=in_grasp,
+            other=None if other is None else other.taken(frames),
+            settings=settings,
+            attraction=attraction,
+            part=part,
+            passed=None if passed is None else passed[frames],
+        )
+
+    def corrected(self) -> HandPose:
+        """The corrected pose of every frame."""
+
+        def stepped(state: tuple[EvaluatedPose, np.ndarray], step: np.ndarray) -> tuple[EvaluatedPose, np.ndarray]:
+            points = state[1] + step
+            return self.objective.evaluate(self.weights @ points), points
+
+        start = self.objective.start, np.zeros((self.weights.shape[1], N_UNKNOWNS))
+        _, control_points = minimize_banded(
+            start, self._cost, self._equations, stepped, max_steps=self.settings.steps, min_gain=self.settings.enough
+        )
+        return self.pose.moved(self.all_weights @ control_points)
+
+    def _cost(self, state: tuple[EvaluatedPose, np.ndarray]) -> float:
+        evaluated, control_points = state
+        points_m = control_points * _LEVER_M
+        bending = (points_m * (self.bend @ points_m)).sum()
+        return float(self.frame_weight @ self.objective.costs(evaluated) + bending)
+
+    def _equations(self, state: tuple[EvaluatedPose, np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
+        """Blocks and minus half the gradient, as ``solve_blocks`` takes them."""
+        evaluated, control_points = state
+        matrix, vector = self.objective.equations(evaluated)
+        matrix, blocks, count = matrix * self.frame_weight[:, None, None], [], self.weights.shape[1]
+        for offset in range(min(4, count)):
+            products = self.weights[:, : count - offset] * self.weights[:, offset:]
+            block = (products.T @ matrix.reshape(len(matrix), -1)).reshape(-1, N_UNKNOWNS, N_UNKNOWNS)
+            blocks.append(block + np.diagonal(self.bend, offset)[:, None, None] * np.diag(_LEVER_M**2))
+        gradient = self.weights.T @ (vector * self.frame_weight[:, None])
+        return blocks, gradient - self.bend @ control_points * _LEVER_M**2
+
+
+def _representative_frames(
+    grasps: Sequence[Interval], valid: np.ndarray, per_grasp: int, frame_step: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Frames to evaluate, how many frames each represents, and whether it is in a grasp.
+
+    per_grasp: frames that represent a grasp. frame_step: outside of grasps one of so many frames is evaluated.
+    """
+    weight, in_grasp = np.zeros(len(valid)), np.zeros(len(valid), bool)
+    for start, stop in grasps:
+        in_grasp[start:stop] = True
+        middles = ((np.arange(per_grasp) + 0.5) * (stop - start) / per_grasp).astype(int)
+        weight[start + middles] = (stop - start) / per_grasp
+    weight[np.flatnonzero(~in_grasp & valid)[frame_step // 2 :: frame_step]] = frame_step
+    frames = np.flatnonzero(weight)
+    return frames, weight[frames], in_grasp[frames]
