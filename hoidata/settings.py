@@ -14,20 +14,37 @@ from hoidata.errors import BadInput
 Config = TypeVar("Config")
 NONE = type(None)
 # Old and new names of keys of params.yaml. A file with an old name is refused, and the message has the new name.
-RENAMED_KEYS: dict[str, str] = {
-    # BimArt
-    "window": "window_frames",
-    "map_of": "contact_map_target",
-    "most_m": "max_distance_m",
-    "floor": "min_std_fraction",
-    "windows": "windows_per_clip",
-    "rule": "guidance_rule",
-    "guide": "contact_guidance",
-    "guide_share": "contact_guidance_fraction",
-    # ManipNet
-    "keep": "keep_probability",
-    "rows": "steps_per_clip",
-    "astray": "perturbed_fraction",
+RENAMED_KEYS: dict[str, tuple[str, ...]] = {
+    "astray": ("perturbed_fraction",),
+    "condition_everywhere": ("condition_every_token",),
+    "contact_draws": ("contact_map_samples",),
+    "drawn_by": ("sampled_from",),
+    "draws": ("max_attempts",),
+    "exchanged": ("swap_contact_maps",),
+    "floor": ("min_std_fraction",),
+    "generated": ("coarse_motions",),
+    "guide": ("contact_guidance",),
+    "guide_share": ("contact_guidance_fraction",),
+    "hold": ("contact_refinement",),
+    "keep": ("keep_probability",),
+    "map_of": ("contact_map_target",),
+    "modulated": ("adaptive_norm",),
+    "most_m": ("max_distance_m",),
+    "object_place": ("object_reference_point",),
+    "object_turn": ("object_rotation",),
+    "objects": ("object_count",),
+    "parts": ("micro_batches",),
+    "rest_m": ("rest_threshold_m",),
+    "rotation_reach": ("rotation_unit",),
+    "rows": ("steps_per_clip",),
+    "rule": ("guidance_rule",),
+    "thin_contact": ("subsample_contact",),
+    "told": ("condition_on_hands_and_length", "condition_on_hands",),
+    "touch": ("contact_target",),
+    "verbs": ("verb_count",),
+    "window": ("window_frames",),
+    "windows": ("windows_per_clip",),
+    "wrist_reach_m": ("wrist_unit_m",),
 }
 
 
@@ -108,7 +125,7 @@ def refuse_unknown(values: Mapping[str, Any], allowed: Sequence[str], source: st
     """Raise BadInput with the keys that are not allowed and those that are."""
     if unknown := [str(name) for name in values if name not in allowed]:
         section = key_in_file(values, unknown[0], source).removesuffix(f".{unknown[0]}")
-        new_names = [f"{name} is now {RENAMED_KEYS[name]}" for name in unknown if RENAMED_KEYS.get(name) in allowed]
+        new_names = [f"{name} is now {new}" for name in unknown for new in RENAMED_KEYS.get(name, ()) if new in allowed]
         raise BadInput(
             section, f"keys among: {', '.join(allowed)}", ", ".join(unknown), "; ".join(new_names) or "correct it"
         )

@@ -1,5 +1,5 @@
-"""Model families on annotated clips: ``registry`` names them, ``common`` is what they share, a folder each holds them.
+"""Model families on annotated clips: ``registry`` lists them, ``common`` has what they share, each has a folder.
 
-What the pipelines use: ``registry.load_family`` and ``load_network``; ``common.training.train_network`` writes a
-checkpoint, ``common.predicting.sample_family`` a store of clips, ``text2hoi.generation.generate`` a motion for a text.
+Entry points: ``registry.load_family`` and ``load_network``; ``common.training.train_network`` writes a checkpoint,
+``common.predicting.sample_family`` a store of clips, ``text2hoi.generation.generate`` a motion for a text.
 """

@@ -79,7 +79,7 @@ def generate_files(asked: Asked, out: Path) -> Written:
         user = read_user_object(asked.object, asked.mesh.unit, asked.mesh.up, asked.mesh.hinge)
         notes += [*user.notes, *mesh_notes(user.model)]
     wording = _wording(asked)
-    verb, thing = wording.verb, wording.thing
+    verb, thing = wording.verb, wording.noun
     models, why = (asked.models, "") if asked.models else _of_project(asked, verb, thing)
     notes += [*wording.notes, *([why] if why else [])]
     make_repeatable(threads=1)  # one motion is too small for two threads to agree on
@@ -88,7 +88,7 @@ def generate_files(asked: Asked, out: Path) -> Written:
     notes += _no_hinge(verb, asked.object, model)
     sampling = replace(models.sampling, sampler=replace(models.sampling.sampler, **asked.sampler))
     generator = Generator.load(models.checkpoints, hands, models.encoder, sampling=sampling, points=models.points)
-    motions = generator.generate(wording.text, model, asked.wish, wording.thing if user else None)
+    motions = generator.generate(wording.text, model, asked.wish, wording.noun if user else None)
     evidence, hand = motions[0].evidence, motions[0].evidence["hand"]
     if hand["source"] != "rule":
         notes.append(f"hand: {hand['hand']}, since {hand['evidence']} (--hand chooses another)")

@@ -5,10 +5,10 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from hoidata.errors import MissingResource
-from pipelines.lineage.graph import read_graph
+from hoidata.errors import BadInput, MissingResource
+from pipelines.lineage.graph import look_up, read_graph, written_graph
 from pipelines.lineage.manifests import read_manifest
-from pipelines.params import read_params
+from pipelines.params import read_file, read_params
 from pipelines.side_by_side import Run, RunStage, reproduce_side_by_side
 from pipelines.stages.adapters import ensure_manifests, raw_files
 from pipelines.stages.base import StagePaths
@@ -40,6 +40,7 @@ def stage_environment() -> dict[str, str]:
 
 def preflight() -> None:
     """Write again a generated corpus that a conversion is about to read; refuse when the user's files are missing."""
+    require_settings(Path())
     params = read_params(Path())
     runs = [StagePaths(params["profile"], name) for name in params["datasets"]]
     ensure_manifests(params["profile"], params["datasets"])
@@ -55,6 +56,26 @@ def preflight() -> None:
                 raw_files(paths)
         elif f"raw@{paths}" not in stale and f"convert@{paths}" in stale:
             write_generated(paths, read_manifest(paths.manifest), paths.generated_raw)
+
+
+def require_settings(root: Path) -> None:
+    """Raise BadInput if a stage depends on a key that params.yaml lacks; DVC's error does not say what to add.
+
+    Usually it is the section of a new network under one of the presets or sizes. An empty section is enough.
+    """
+    values = read_file(root / "params.yaml")
+    for stage in written_graph(root).values():
+        for key in stage.params:
+            try:
+                look_up(values, key)
+            except BadInput as error:
+                if (root / key).is_file():  # a stage may depend on another file of settings
+                    continue
+                section, _, name = key.rpartition(".")
+                remedy = f"add `{name}: {{}}` under `{section}`, or remove the key from the stage's `params`"
+                raise BadInput(
+                    f"params.yaml: {key}", f"a section for the stage {stage.name}", "none", remedy
+                ) from error
 
 
 def _is_readable(paths: StagePaths) -> bool:

@@ -1,7 +1,7 @@
-"""Recorded clips as they might have been: paths longer, shorter and to another side, turns larger, moments earlier.
+"""Data augmentation: recorded clips with longer, shorter or redirected paths, scaled rotations and warped time.
 
-Of a few hundred clips a contact map, a verb and a length name one; a network that has learnt them by name looks away
-from what it is to denoise. What its condition cannot know it has to look for.
+With a few hundred clips, contact map, verb and length identify a clip. A network that has memorised the clips ignores
+the motion that it is to denoise. Augmentation changes what the condition does not determine.
 """
 
 import math
@@ -26,28 +26,28 @@ from models.common.features import (
     to_object_frame,
 )
 
-# Logarithms of how much longer paths and turns become, radians of where paths lead, changes of speed: at most.
-PATH, TURN, SIDE_RAD, SPEED = 0.2, 0.15, 0.35, 0.1
-MOST_BYTES = 4 << 30  # some 9,000 copies of 150 frames
-# A turn that comes near to half a circle is left as it is: beyond that its axis is another one.
-LARGEST_TURN_RAD = 2.4
+# Largest changes: log scale of paths and of rotations, direction of paths in radians, relative speed.
+PATH, ROTATION, DIRECTION_RAD, SPEED = 0.2, 0.15, 0.35, 0.1
+MAX_CACHE_BYTES = 4 << 30  # some 9,000 copies of 150 frames
+# A larger rotation is not scaled: near half a circle the axis becomes ambiguous.
+MAX_SCALED_ROTATION_RAD = 2.4
 
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Makes ``count`` augmented copies of every clip of ``dataset`` and keeps the last that were asked for.
+    """Creates ``count`` augmented copies of every clip of ``dataset``, with a cache of recent ones.
 
-    A copy has the clip's hands, contact, hinge angles and length; of a clip longer than a batch takes, it has a window
-    of its own, so that a training meets the same copies again. Hands go with the object as they did.
+    Copies keep hand poses relative to the object, contact, hinge angles and length. Each copy of a clip longer than
+    ``dataset.max_frames`` has a fixed window, so that a training sees the same copies again.
     """
 
     dataset: HoiDataset
     count: int
-    made: LRUCache = field(default_factory=lambda: LRUCache(MOST_BYTES, _bytes))
+    cache: LRUCache = field(default_factory=lambda: LRUCache(MAX_CACHE_BYTES, _bytes))
 
-    @cachedmethod(lambda self: self.made, key=lambda self, clip_id, number: (clip_id, number))
+    @cachedmethod(lambda self: self.cache, key=lambda self, clip_id, number: (clip_id, number))
     def copy_of(self, clip_id: str, number: int) -> ClipSample:
-        """The augmented copy of that number, from 1."""
+        """The augmented copy with this number, from 1."""
         sample, seed = self.dataset.whole(clip_id), [number, 0, *clip_id.encode()]
         spare = sample.length - self.dataset.max_frames
         if spare > 0:
@@ -61,27 +61,30 @@ def _bytes(sample: ClipSample) -> int:
 
 
 def augment(sample: ClipSample, random: np.random.Generator, number: int) -> ClipSample:
-    """One augmented copy, drawn from ``random``; ``number`` becomes part of its name.
+    """One augmented copy; ``number`` becomes part of its name.
 
-    Between two frames all is on straight lines, but for distances to points, which are those of the nearer frame.
+    Values between two frames are interpolated linearly; distance entries are those of the closest frame.
     """
     moments = warped_moments(sample.length, random)
-    thing = torch.from_numpy(sample.object)
-    hands = hands_in_object_frame(torch.from_numpy(sample.hands)[None], thing[None])[0]
-    joints = to_object_frame(torch.from_numpy(sample.joints_m), thing.expand(2, -1, -1))
-    middle = base_middle_m(torch.from_numpy(sample.points.points_m), torch.from_numpy(sample.points.part))
-    path = proper_object(at_moments(placed_at(thing, middle), moments))
-    moved = placed_at(augmented_path(path, random), -middle)
+    objects = torch.from_numpy(sample.object)
+    hands = hands_in_object_frame(torch.from_numpy(sample.hands)[None], objects[None])[0]
+    joints = to_object_frame(torch.from_numpy(sample.joints_m), objects.expand(2, -1, -1))
+    centre = base_middle_m(torch.from_numpy(sample.points.points_m), torch.from_numpy(sample.points.part))
+    # The path of the box centre is changed, so that a scaled rotation does not move the object.
+    path = proper_object(at_moments(placed_at(objects, centre), moments))
+    moved_objects = placed_at(augmented_path(path, random), -centre)
     before, after = np.floor(moments).astype(int), np.ceil(moments).astype(int)
-    world = proper_hands(hands_in_world(at_moments(hands, moments, 1)[None], moved[None])[0])
-    placed = at_moments(joints, moments, 1) @ object_rotmat(moved).transpose(-1, -2) + moved[:, None, OBJECT_POSITION]
+    world = proper_hands(hands_in_world(at_moments(hands, moments, 1)[None], moved_objects[None])[0])
+    # Joints are interpolated in the object's frame, then moved with the new path.
+    rotated = at_moments(joints, moments, 1) @ object_rotmat(moved_objects).transpose(-1, -2)
+    joints_m = rotated + moved_objects[:, None, OBJECT_POSITION]
     distances = entries_at(sample.distances, np.rint(moments).astype(int))
     return replace(
         sample,
         clip_id=f"{sample.clip_id} copy {number}",
         hands=world.numpy(),
-        object=moved.numpy(),
-        joints_m=placed.numpy(),
+        object=moved_objects.numpy(),
+        joints_m=joints_m.numpy(),
         valid=sample.valid[:, before] & sample.valid[:, after],
         contact=contact_of(distances, len(sample.points.points_m), sample.contact_threshold_m),
         distances=distances,
@@ -89,38 +92,40 @@ def augment(sample: ClipSample, random: np.random.Generator, number: int) -> Cli
 
 
 def warped_moments(length: int, random: np.random.Generator) -> np.ndarray:
-    """(length,) frames of a clip, from its first to its last, that the frames of a copy show."""
-    share = np.linspace(0, 1, length)
+    """Time warp: for each frame of a copy, the time in the clip in frames (length,); first and last are fixed."""
+    time = np.linspace(0, 1, length)
     first, second = random.uniform(-SPEED, SPEED, 2)
-    moved = share + first * np.sin(math.pi * share) / math.pi + second * np.sin(2 * math.pi * share) / (2 * math.pi)
-    return np.clip(moved, 0, 1) * (length - 1)
+    warped = time + first * np.sin(math.pi * time) / math.pi + second * np.sin(2 * math.pi * time) / (2 * math.pi)
+    return np.clip(warped, 0, 1) * (length - 1)
 
 
-def augmented_path(thing: torch.Tensor, random: np.random.Generator) -> torch.Tensor:
-    """Object features (F, 10), their position that of the object's middle, with another path and other turns."""
-    side, up, turn = np.exp(random.uniform(-1, 1, 3) * (PATH, PATH, TURN))
-    yaw = rotvec_to_rotmat(np.array([0.0, 0.0, random.uniform(-SIDE_RAD, SIDE_RAD)])) * (side, side, up)
-    start = thing[:1, OBJECT_POSITION]
-    position = start + (thing[:, OBJECT_POSITION] - start) @ torch.from_numpy(yaw).to(thing).T
-    rotation = object_rotmat(thing)
-    turned = rotmat_to_rotvec(rotation @ rotation[0].T)
-    if turned.norm(dim=-1).max() < LARGEST_TURN_RAD:
-        rotation = rotvec_to_rotmat(turned * turn) @ rotation[0]
-    return torch.cat((position, rotmat_to_rot6d(rotation), thing[:, OBJECT_HINGE:]), -1)
+def augmented_path(objects: torch.Tensor, random: np.random.Generator) -> torch.Tensor:
+    """Object features (F, 10) with random path and rotations; their position is the object's box centre."""
+    horizontal, vertical, angle_factor = np.exp(random.uniform(-1, 1, 3) * (PATH, PATH, ROTATION))
+    yaw = rotvec_to_rotmat(np.array([0.0, 0.0, random.uniform(-DIRECTION_RAD, DIRECTION_RAD)]))
+    yaw = yaw * (horizontal, horizontal, vertical)
+    start = objects[:1, OBJECT_POSITION]
+    position = start + (objects[:, OBJECT_POSITION] - start) @ torch.from_numpy(yaw).to(objects).T
+    rotation = object_rotmat(objects)
+    rotation_vector = rotmat_to_rotvec(rotation @ rotation[0].T)
+    if rotation_vector.norm(dim=-1).max() < MAX_SCALED_ROTATION_RAD:
+        rotation = rotvec_to_rotmat(rotation_vector * angle_factor) @ rotation[0]
+    return torch.cat((position, rotmat_to_rot6d(rotation), objects[:, OBJECT_HINGE:]), -1)
 
 
-def at_moments(rows: torch.Tensor, moments: np.ndarray, axis: int = 0) -> torch.Tensor:
-    """Rows at moments between frames of ``axis``, on straight lines."""
+def at_moments(values: torch.Tensor, moments: np.ndarray, axis: int = 0) -> torch.Tensor:
+    """Linear interpolation of ``values`` at times in frames along ``axis``."""
     before = np.floor(moments).astype(int)
-    share = torch.from_numpy(moments - before).to(rows).reshape(-1, *[1] * (rows.ndim - 1 - axis))
-    first, second = (rows.index_select(axis, torch.from_numpy(own)) for own in (before, np.ceil(moments).astype(int)))
-    return first + share * (second - first)
+    fraction = torch.from_numpy(moments - before).to(values).reshape(-1, *[1] * (values.ndim - 1 - axis))
+    after = np.ceil(moments).astype(int)
+    first, second = (values.index_select(axis, torch.from_numpy(frames)) for frames in (before, after))
+    return first + fraction * (second - first)
 
 
 def entries_at(entries: DistanceEntries, frames: np.ndarray) -> DistanceEntries:
-    """Entries, in the order of their frames, of a clip that shows these frames (F,) one after the other."""
+    """Distance entries, ordered by frame, of a clip that consists of these frames (F,) of the original."""
     first, last = (np.searchsorted(entries.frame, frames, side) for side in ("left", "right"))
     counts = last - first
-    rows = np.arange(counts.sum()) + np.repeat(first - np.concatenate(([0], counts.cumsum()[:-1])), counts)
-    chosen = entries.select(rows)
+    indices = np.arange(counts.sum()) + np.repeat(first - np.concatenate(([0], counts.cumsum()[:-1])), counts)
+    chosen = entries.select(indices)
     return replace(chosen, frame=np.repeat(np.arange(len(frames)), counts).astype(chosen.frame.dtype))

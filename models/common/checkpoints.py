@@ -1,7 +1,7 @@
-"""Checkpoints: one safetensors file with weights, config, normalisation and provenance; nothing in it is ever executed.
+"""Checkpoints: one safetensors file with weights, config, normalisation and provenance. Loading executes no code.
 
-The header has exactly one metadata key, ``hoidata``, holding canonical JSON: safetensors keeps several keys in a hash
-map, whose order changes from run to run, and equal trainings must give equal bytes. Files carry no time, host or user.
+The header has one metadata key, ``hoidata``, with canonical JSON. With several keys safetensors would write them in the
+order of a hash map, but equal trainings must give equal bytes. Files contain no time, host or user.
 """
 
 import json
@@ -29,13 +29,11 @@ _WEIGHTS, _NORMALISER = "weights.", "normaliser."
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A trained network in evaluation mode, the normalisation it was trained with (or None), and what is known of it.
-
-    info: "model", "config", "facts" (clips, counts, synthetic, encoder, hand, ...), "results" and "provenance".
-    """
+    """A trained network in evaluation mode, with its normalisation and metadata."""
 
     network: nn.Module
-    normaliser: Normaliser | None
+    normaliser: Normaliser | None  # None if the network was trained without one
+    # "model", "config", "facts" (clips, counts, synthetic, encoder, hand, ...), "results" and "provenance".
     info: dict[str, Any]
 
     @property
@@ -46,18 +44,20 @@ class Checkpoint:
 def save_checkpoint(
     folder: str | Path, model_name: str, network: nn.Module, normaliser: Normaliser | None, info: dict[str, Any]
 ) -> Path:
-    """Write ``model.safetensors`` into ``folder``, whole or not at all. info: "facts", "results", "provenance"."""
+    """Write ``folder/model.safetensors`` atomically. info: "facts", "results", "provenance"."""
     tensors = {_WEIGHTS + name: tensor for name, tensor in network.state_dict().items()}
     if normaliser is not None:
         tensors |= {_NORMALISER + name: tensor for name, tensor in normaliser.tensors().items()}
     tensors = {name: tensors[name].detach().cpu().contiguous() for name in sorted(tensors)}
-    own = {"format": FORMAT, "model": model_name, "config": plain_config(network.config)}
-    known = {**own, **info, "seal": OPEN_SEAL}  # never the seal of the file the facts were read from
-    return write_whole(Path(folder) / FILE_NAME, sealed(save(tensors, metadata={METADATA_KEY: canonical_json(known)})))
+    header = {"format": FORMAT, "model": model_name, "config": plain_config(network.config)}
+    metadata = {**header, **info, "seal": OPEN_SEAL}  # not the checksum of a file from which the facts were read
+    return write_whole(
+        Path(folder) / FILE_NAME, sealed(save(tensors, metadata={METADATA_KEY: canonical_json(metadata)}))
+    )
 
 
 def read_info(path: str | Path) -> dict[str, Any]:
-    """The metadata of a checkpoint file. Raises BadInput for anything else."""
+    """The metadata of a checkpoint file. Raises BadInput for any other file."""
     try:
         with safe_open(path, framework="pt") as stored:
             metadata = stored.metadata() or {}
@@ -70,14 +70,14 @@ def read_info(path: str | Path) -> dict[str, Any]:
 
 
 def checkpoint_file(folder: str | Path) -> Path:
-    """The file of a checkpoint's folder; of a file itself."""
+    """The checkpoint file in a folder; a path of a checkpoint file itself is returned."""
     return Path(folder) if str(folder).endswith(".safetensors") else Path(folder) / FILE_NAME
 
 
 def load_checkpoint(folder: str | Path, network: StoredNetwork, device: torch.device | str = "cpu") -> Checkpoint:
-    """The checkpoint of ``network`` in ``folder``, or of a file.
+    """Load the checkpoint of ``network`` from a folder or a file.
 
-    Raises BadInput where there is none, one of another network, or one with weights that are not finite.
+    Raises BadInput if it is missing, is of another network, or has weights that are not finite.
     """
     path = checkpoint_file(folder)
     if not path.is_file():
@@ -94,8 +94,8 @@ def load_checkpoint(folder: str | Path, network: StoredNetwork, device: torch.de
         module.load_state_dict(_below(tensors, _WEIGHTS))
     except RuntimeError as error:
         raise BadInput(path, "weights that fit its config", str(error).splitlines()[0], "train it again") from error
-    if spoilt := [name for name, tensor in tensors.items() if not bool(tensor.isfinite().all())]:
-        got = f"NaN or infinity in {len(spoilt)} tensors, such as {spoilt[0]}"
+    if not_finite := [name for name, tensor in tensors.items() if not bool(tensor.isfinite().all())]:
+        got = f"NaN or infinity in {len(not_finite)} tensors, such as {not_finite[0]}"
         raise BadInput(path, "finite weights", got, "train it again with a lower learning rate")
     normaliser = _below(tensors, _NORMALISER)
     return Checkpoint(
@@ -110,11 +110,11 @@ def _config(network: StoredNetwork, info: dict[str, Any], path: Path) -> Any:
         return build_config(network.config, info["config"], f"{path}: config")
     except BadInput as error:
         remedy = "train it again with this version"
-        raise BadInput(path, "settings this version knows", str(error), remedy) from error
+        raise BadInput(path, "settings of this version", str(error), remedy) from error
 
 
 def write_empty(folder: str | Path, reason: str) -> Path:
-    """``empty.json`` in place of a checkpoint that could not be trained, with the reason."""
+    """Write ``empty.json`` instead of a checkpoint, with the reason."""
     return write_whole(Path(folder) / EMPTY, canonical_json({"reason": reason}) + "\n")
 
 

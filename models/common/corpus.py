@@ -1,4 +1,4 @@
-"""Clips for a training: the two splits that may be read, batches in a repeatable order, and facts to record."""
+"""Clips for training: the train and validation splits, batches in a reproducible order, and facts for checkpoints."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -26,18 +26,14 @@ HAND_TYPES = ("left", "right", "both")
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What of every batch is asked for. frames, entries: of each clip and in all, for losses of geometry (``Sight``).
+class BatchSpec:
+    """What batches contain."""
 
-    parts: those of ``of`` equal parts of a batch that this process computes. augmented_copies: of every clip, beside it
-    (``Augmentation``).
-    """
-
-    frames: int = 0
-    entries: int = 0
-    parts: Sequence[int] = (0,)
-    of: int = 1
-    augmented_copies: int = 0
+    frames: int = 0  # selected frames per clip, for losses of geometry (``Sight``)
+    entries: int = 0  # distance entries per batch, for losses of geometry
+    parts: Sequence[int] = (0,)  # numbers of the micro-batches of this process
+    of: int = 1  # micro-batches of a batch, of all processes
+    augmented_copies: int = 0  # per clip, in addition to the clip (``Augmentation``)
 
 
 @dataclass(frozen=True)
@@ -50,33 +46,33 @@ class Corpus:
 
     @classmethod
     def of(cls, annotated: AnnotatedStore, seed: int, crop: Crop = "random") -> "Corpus":
-        """``crop`` is for long training clips; of long validation clips the first frames are taken."""
+        """crop: of training clips that are too long; long validation clips are cut to their first frames."""
         train = HoiDataset(annotated, "train", crop=crop, seed=seed)
         return cls(annotated, train, HoiDataset(annotated, "validation", crop="start"))
 
     @property
     def held_out(self) -> list[ClipSample]:
-        """Validation clips, none where the split has none: nothing is chosen then."""
+        """Validation clips; may be empty."""
         return list(self.validation)
 
     def digest(self) -> str:
-        """SHA-256 of all that training and validation see of the clips: arrays, words and meshes."""
-        found, subsets = sha256(), (self.train, self.validation)
+        """SHA-256 of everything that training and validation read from clips: arrays, sentences and meshes."""
+        digest, subsets = sha256(), (self.train, self.validation)
         for sample in itertools.chain.from_iterable(map(subset.whole, subset.ids) for subset in subsets):
             model, entries = sample.object_model, sample.distances
             words = (sample.clip_id, sample.hand_type, sample.verb, *sample.sentences, len(sample.object))
-            found.update(canonical_json(words).encode())
+            digest.update(canonical_json(words).encode())
             arrays = (
                 *(sample.hands, sample.object, sample.joints_m, sample.valid, sample.betas, sample.template_m),
                 *(sample.text, sample.contact, *vars(sample.points).values(), *vars(entries).values()),
                 *(model.vertices_m, model.faces, model.part),
             )
             for array in arrays:
-                found.update(b"" if array is None else np.ascontiguousarray(array).data)
-        return found.hexdigest()
+                digest.update(b"" if array is None else np.ascontiguousarray(array).data)
+        return digest.hexdigest()
 
     def facts(self, hands: HandPair) -> dict[str, Any]:
-        """What a checkpoint records about its clips."""
+        """What a checkpoint stores about its clips."""
         clips = {"train": list(self.train.ids), "validation": list(self.validation.ids)}
         samples = [*self.train, *self.validation]
         names = sorted({sample.dataset for sample in samples})
@@ -95,59 +91,60 @@ class Corpus:
 
 
 def batches(
-    dataset: HoiDataset, size: int, seed: int, wanted: Wanted = Wanted(), start: int = 0
+    dataset: HoiDataset, size: int, seed: int, spec: BatchSpec = BatchSpec(), start: int = 0
 ) -> Iterator[list[tuple[int, ClipBatch]]]:
-    """Endless steps of about ``size`` clips, from step ``start`` on; each the parts asked for, with their numbers.
+    """Endless batches of about ``size`` clips, from step ``start``; each as micro-batches with their numbers.
 
-    Every epoch has a new order and meets every clip once. All that is drawn comes from (seed, epoch) or (seed, step,
-    part), so that a training that goes on finds what it would have found.
+    Every epoch has a new order and contains every clip once. Random numbers depend on (seed, epoch) or (seed, step,
+    part), so that a resumed training gets the same batches.
     """
     lengths = [min(dataset.whole(clip_id).length, dataset.max_frames) for clip_id in dataset.ids]
-    augmentation = Augmentation(dataset, wanted.augmented_copies)
-    for step, (epoch, rows) in enumerate(_plan(lengths, size, seed), 1):
+    augmentation = Augmentation(dataset, spec.augmented_copies)
+    for step, (epoch, indices) in enumerate(_plan(lengths, size, seed), 1):
         if step > start:
             dataset.set_epoch(epoch)
-            parts = {part: rows[part :: wanted.of] or rows[:1] for part in wanted.parts}
+            parts = {part: indices[part :: spec.of] or indices[:1] for part in spec.parts}
             yield [
-                (part, _collated([dataset[row] for row in own], wanted, (seed, step, part), augmentation))
-                for part, own in parts.items()
+                (part, _collated([dataset[index] for index in part_indices], spec, (seed, step, part), augmentation))
+                for part, part_indices in parts.items()
             ]
 
 
 def _collated(
     samples: list[ClipSample],
-    wanted: Wanted,
-    drawn_from: tuple[int, int, int],
+    spec: BatchSpec,
+    seed: tuple[int, int, int],
     augmentation: Augmentation,
 ) -> ClipBatch:
     if augmentation.count:
-        numbers = np.random.default_rng([*drawn_from, 2]).integers(0, augmentation.count + 1, len(samples)).tolist()
-        samples = [augmentation.copy_of(one.clip_id, n) if n else one for one, n in zip(samples, numbers, strict=True)]
-    random = np.random.default_rng(drawn_from)
+        numbers = np.random.default_rng([*seed, 2]).integers(0, augmentation.count + 1, len(samples)).tolist()
+        samples = [
+            augmentation.copy_of(clip.clip_id, n) if n else clip for clip, n in zip(samples, numbers, strict=True)
+        ]
+    random = np.random.default_rng(seed)
     lengths = [sample.length for sample in samples]
-    sight = Sight.drawn(lengths, wanted.frames, wanted.entries, random) if wanted.frames else None
+    sight = Sight.drawn(lengths, spec.frames, spec.entries, random) if spec.frames else None
     return collate(samples, sight)
 
 
 def _plan(lengths: list[int], size: int, seed: int) -> Iterator[tuple[int, list[int]]]:
-    """Epoch and clips of every step. Clips of like length share a batch, which saves padding: within each interval of a
-    few batches they are sorted."""
+    """Epoch and clip indices of every step. Within a few batches, clips are sorted by length, which saves padding."""
     for epoch in itertools.count():
         random = np.random.default_rng([seed, epoch])
         for window in _split(random.permutation(len(lengths)).tolist(), size * BUCKET_BATCHES):
-            groups = _split(sorted(window, key=lambda row: (lengths[row], row)), size)
+            groups = _split(sorted(window, key=lambda index: (lengths[index], index)), size)
             for number in random.permutation(len(groups)):
                 yield epoch, groups[number]
 
 
 def _split(items: list[Item], size: int) -> list[list[Item]]:
-    """The items in order, in as many nearly equal parts as come closest to ``size`` each."""
+    """The items in order, in nearly equal parts whose size is closest to ``size``."""
     parts = max(1, round(len(items) / size))
     edges = [len(items) * part // parts for part in range(parts + 1)]
     return [items[start:stop] for start, stop in pairwise(edges)]
 
 
 def any_form(batch: ClipBatch, generator: torch.Generator) -> Tensor:
-    """(B, 512) features of one of the four sentences of each clip, drawn evenly."""
+    """(B, 512) features of one of the four sentences of each clip, chosen uniformly."""
     form = torch.randint(batch.text.shape[1], (len(batch),), generator=generator)
     return batch.text[torch.arange(len(batch), device=batch.text.device), send(form, batch.text.device)]

@@ -1,4 +1,4 @@
-"""What a model family is: its networks, and the one question it answers: motions for requests."""
+"""The interface of a model family: networks to train, and a sampler that answers requests with motions."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -33,97 +33,93 @@ Losses = dict[str, Tensor]
 
 
 class Objective(Protocol):
-    """How to train one network. frames, entries: how many frames of each clip and distance entries of all of them
-    batches are to carry for its losses (``Wanted``)."""
+    """How to train one network."""
 
-    frames: int
-    entries: int
+    frames: int  # selected frames per clip that the losses need (``BatchSpec``)
+    entries: int  # distance entries per batch that the losses need (``BatchSpec``)
 
     @property
     def network(self) -> nn.Module: ...
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
-        """Named losses of one training batch; "total" is the one to minimise."""
+        """Loss terms of one training batch; "total" is minimised."""
         ...
 
     def validation(self, network: nn.Module) -> Tensor:
-        """() the loss on held-out clips, always with the same draws; network is in evaluation mode.
+        """() the loss on validation clips, with fixed random numbers; ``network`` is in evaluation mode.
 
-        Called only where there are validation clips (``Corpus.held_out``).
+        Not called without validation clips (``Corpus.held_out``).
         """
         ...
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What an objective is made from. network, loss: its configs. trained: the checkpoint of each network it needs."""
+    """The inputs of an objective."""
 
-    network: Any
-    loss: Any
+    network: Any  # config of the network
+    loss: Any  # config of the loss, or None
     seed: int
     corpus: Corpus
     hands: Hands
     device: torch.device
-    trained: Mapping[str, Any]
+    trained: Mapping[str, Any]  # checkpoints of the networks in ``Network.needs``
 
 
 @dataclass(frozen=True)
 class StoredNetwork:
-    """What reading a checkpoint needs. name: that it says of itself. config: a frozen dataclass; build: to a module."""
+    """A network that a checkpoint can contain."""
 
-    name: str
-    config: type
-    build: Callable[[Any], nn.Module]
+    name: str  # stored in the checkpoint
+    config: type  # a frozen dataclass
+    build: Callable[[Any], nn.Module]  # from the config
 
 
 @dataclass(frozen=True)
 class Network(StoredNetwork):
-    """One network of a family, trained by one stage; ``name`` is that of its checkpoint folder, unique over all.
+    """One network of a family, trained by one stage; ``name`` is unique and names its checkpoint folder."""
 
-    objective: how it is trained, with the normalisation it is trained in or None. loss: config of the objective.
-    needs: names of the networks that must be trained before. crop: of training clips that are too long.
-    results: what else is found on training and validation clips and kept in the checkpoint, as plain values.
-    """
-
+    # Creates the objective, and the normalisation of the features or None.
     objective: Callable[[Setup], tuple[Objective, Normaliser | None]]
+    # Config class of the loss; None without settings.
     loss: type | None = None
+    # Names of networks that are trained before and passed to the objective.
     needs: tuple[str, ...] = ()
+    # Which window of a training clip that is too long.
     crop: Literal["random", "start"] = "random"
+    # Plain values computed after training on training and validation clips, and stored in the checkpoint.
     results: Callable[[nn.Module, Corpus], Mapping[str, Any]] = lambda network, corpus: {}
 
 
 @dataclass(frozen=True)
 class Sources:
-    """What a family may use to answer. annotated: the dataset; checkpoints: folder with one folder per network.
-
-    hands: the hand model of the dataset's clips. settings: sections of families, by name.
-    """
+    """What a family may read to answer requests."""
 
     annotated: AnnotatedStore
-    checkpoints: Path
-    hands: HandPair
+    checkpoints: Path  # folder with one folder per network
+    hands: HandPair  # the hand model of the dataset's clips
     device: torch.device
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)  # section of params.yaml by family
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A request that a family has no answer to. clip_id: of the motion that was asked for; reason: in words."""
+    """A request that a family cannot answer."""
 
-    clip_id: str
-    reason: str
+    clip_id: str  # of the requested motion
+    reason: str  # in words
 
 
 class Sampler(Protocol):
-    """A family that is ready to answer."""
+    """A loaded family."""
 
     def sample(self, requests: Sequence[Request]) -> Sequence[Clip | LeftOut]:
-        """One answer per request, in their order. A request gives the same motion in whatever company it is asked."""
+        """One answer per request, in order. An answer does not depend on the other requests."""
         ...
 
 
 class EachAlone:
-    """A sampler that answers every request by itself."""
+    """A sampler that answers requests one by one."""
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         return [self.motion(request) for request in requests]
@@ -135,25 +131,25 @@ class EachAlone:
 
 @dataclass(frozen=True)
 class Family:
-    """A model family. title: in words, for tables. networks: what it trains itself.
-
-    uses: networks its motions need, of whatever family. load: makes it ready. diagnose: figures from inside its
-    networks on the test clips, by network; {} for most.
-    """
+    """A model family."""
 
     name: str
-    title: str
+    title: str  # for tables
     load: Callable[[Sources], Sampler]
-    networks: tuple[Network, ...] = ()
-    uses: tuple[str, ...] = ()
+    networks: tuple[Network, ...] = ()  # trained by this family
+    uses: tuple[str, ...] = ()  # names of networks that sampling needs, of any family
+    # Metrics of its networks on the test clips: name of the network to metrics.
     diagnose: Callable[[Sources], Figures] = lambda sources: {}
 
 
 def motion_clip(request: Request, hands: Tensor, objects: Tensor, synthetic: bool) -> Clip:
-    """Features (2, F, 99) and (F, 10) of the model frame as the clip that was asked for.
+    """The requested clip from features (2, F, 99) and (F, 10) in the model frame.
 
-    A hand that takes no part is invalid in every frame. synthetic: whether the model learnt from generated data. Raises
-    BadInput where a number of an active hand or of the object is not finite.
+    A hand that is not active is invalid in every frame. Raises BadInput if a number of an active hand or of the object
+    is not finite.
+
+    Args:
+        synthetic: whether the model was trained on generated data.
     """
     refuse_not_finite(request, hands[torch.from_numpy(request.active_hands).to(hands.device)], objects)
     hands, objects = hands[:, : request.n_frames].cpu().double(), objects[: request.n_frames].cpu().double()
@@ -165,8 +161,8 @@ def motion_clip(request: Request, hands: Tensor, objects: Tensor, synthetic: boo
         subject="generated",
         sequence=request.clip_id,
         hands={
-            side: _track(hands[row], bool(request.active_hands[row]), request, row, rotation, origin)
-            for row, side in enumerate(SIDES)
+            side: _track(hands[index], bool(request.active_hands[index]), request, index, rotation, origin)
+            for index, side in enumerate(SIDES)
         },
         object=ObjectTrack(
             request.object,
@@ -183,27 +179,27 @@ def motion_clip(request: Request, hands: Tensor, objects: Tensor, synthetic: boo
     )
 
 
-def refuse_not_finite(request: Request, *made: Tensor | np.ndarray) -> None:
-    """Raise BadInput that names the request where a model's answer holds a number that is not finite."""
-    if not all(bool(torch.isfinite(torch.as_tensor(values)).all()) for values in made):
-        asked = f" ({request.sentence.words})" if request.sentence else ""
+def refuse_not_finite(request: Request, *values: Tensor | np.ndarray) -> None:
+    """Raise BadInput with the request's name if a model's answer has a number that is not finite."""
+    if not all(bool(torch.isfinite(torch.as_tensor(array)).all()) for array in values):
+        sentence = f" ({request.sentence.words})" if request.sentence else ""
         remedy = "lower the guidance (--scale), try another seed, or train the network again"
-        raise BadInput(f"motion {request.motion_id}{asked}", "finite numbers", "NaN or infinity", remedy)
+        raise BadInput(f"motion {request.motion_id}{sentence}", "finite numbers", "NaN or infinity", remedy)
 
 
 def _track(
-    hand: Tensor, active: bool, request: Request, row: int, rotation: np.ndarray, origin: np.ndarray
+    hand: Tensor, active: bool, request: Request, side: int, rotation: np.ndarray, origin: np.ndarray
 ) -> HandTrack:
     n_frames = len(hand)
-    template = None if request.template_m is None else request.template_m[row]
-    betas = request.betas[row][None].astype(np.float32)
+    template = None if request.template_m is None else request.template_m[side]
+    betas = request.betas[side][None].astype(np.float32)
     if not active:
-        nothing = np.zeros((n_frames, 3), np.float32)
-        return HandTrack(
-            nothing, nothing, np.zeros((n_frames, 45), np.float32), betas, np.zeros(n_frames, bool), template
-        )
+        zeros, valid = np.zeros((n_frames, 3), np.float32), np.zeros(n_frames, bool)
+        hand_pose = np.zeros((n_frames, 45), np.float32)
+        return HandTrack(zeros, zeros, hand_pose, betas=betas, valid=valid, template_m=template)
     rotmats = hand_rotmats(hand).numpy()
     rotmats[:, 0] = rotation @ rotmats[:, 0]
-    turns = rotmat_to_rotvec(rotmats).astype(np.float32)
+    rotation_vectors = rotmat_to_rotvec(rotmats).astype(np.float32)
     wrist = (hand_wrist_m(hand).numpy() @ rotation.T + origin).astype(np.float32)
-    return HandTrack(wrist, turns[:, 0], turns[:, 1:].reshape(n_frames, 45), betas, np.ones(n_frames, bool), template)
+    hand_pose, valid = rotation_vectors[:, 1:].reshape(n_frames, 45), np.ones(n_frames, bool)
+    return HandTrack(wrist, rotation_vectors[:, 0], hand_pose, betas=betas, valid=valid, template_m=template)

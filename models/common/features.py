@@ -1,4 +1,4 @@
-"""Motion features to rotations, joints and placed points, in torch; and the normalisation learnt from training clips.
+"""Motion features to rotations, joints and surface points, in torch; and their normalisation.
 
 Feature layout: ``hoidata.clips.features``. Axes (batch, side, frame, ...); sides left, right; metres, model frame.
 """
@@ -29,14 +29,14 @@ from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d, rotvec_
 from hoidata.hands import HandKinematics, HandPair
 
 TEXT_FEATURES = 512  # of a sentence, whatever the encoder
-# Of rows that say how an object has turned since its first frame, after its features: how it lay there.
+# First-frame rotation, appended to features whose rotation is relative to the first frame.
 OBJECT_START_6D = slice(OBJECT_FEATURES, OBJECT_FEATURES + 6)
-# A feature that hardly varies in training is scaled as if it varied this much, so that noise in it stays harmless.
+# Least standard deviation by which a feature is divided, so that noise in a constant feature is not amplified.
 SMALLEST_SCALE = 0.05
 
 
 def scaled_text(text: Tensor) -> Tensor:
-    """Sentence features (..., D) at a length of sqrt(D): numbers near one, whatever length an encoder gives them."""
+    """Sentence features (..., D) scaled to length sqrt(D), independent of the encoder's scale."""
     return nn.functional.normalize(text, dim=-1) * text.shape[-1] ** 0.5
 
 
@@ -66,31 +66,31 @@ def object_hinge_rad(objects: Tensor) -> Tensor:
 
 
 def proper_hands(hands: Tensor) -> Tensor:
-    """Hand features (..., 99) with every 6D part made the first two columns of a rotation."""
+    """Hand features (..., 99) with every 6D rotation made orthonormal."""
     return torch.cat((hands[..., WRIST], rotmat_to_rot6d(hand_rotmats(hands)).flatten(-2)), -1)
 
 
 def proper_object(objects: Tensor) -> Tensor:
-    """Object features (..., 10) with the 6D part made the first two columns of a rotation."""
+    """Object features (..., 10) with the 6D rotation made orthonormal."""
     return torch.cat(
         (objects[..., OBJECT_POSITION], rotmat_to_rot6d(object_rotmat(objects)), objects[..., OBJECT_HINGE:]), -1
     )
 
 
 def base_middle_m(points_m: Tensor, part: Tensor) -> Tensor:
-    """(..., 3) middle of the box about an object's base, object frame; of all of it where no point is of the base.
+    """Centre (..., 3) of the bounding box of an object's base, or of the whole object if no point is of the base.
 
-    points_m: (..., N, 3). part: (..., N) 1 where the hinge moves a point.
+    points_m: (..., N, 3) in the object's frame. part: (..., N), 1 if the hinge moves the point.
     """
     moved = (part == 1) & ~(part == 1).all(-1, keepdim=True)
-    least, most = (points_m.masked_fill(moved[..., None], bound) for bound in (math.inf, -math.inf))
-    return (least.amin(-2) + most.amax(-2)) / 2
+    lowest, highest = (points_m.masked_fill(moved[..., None], bound) for bound in (math.inf, -math.inf))
+    return (lowest.amin(-2) + highest.amax(-2)) / 2
 
 
 def placed_at(objects: Tensor, point_m: Tensor) -> Tensor:
-    """Objects (..., F, 10) whose position is where ``point_m`` (..., 3), in the object's frame, is in the world.
+    """Object features (..., F, 10) with ``point_m`` (..., 3), given in the object's frame, as the position.
 
-    The inverse is that of ``-point_m``.
+    ``-point_m`` inverts it.
     """
     position = objects[..., OBJECT_POSITION] + (object_rotmat(objects) @ point_m[..., None, :, None])[..., 0]
     return torch.cat((position, objects[..., OBJECT_ROTATION_6D.start :]), -1)
@@ -109,7 +109,7 @@ def to_object_frame(points_m: Tensor, objects: Tensor) -> Tensor:
 
 
 def hands_in_object_frame(hands: Tensor, objects: Tensor) -> Tensor:
-    """Hand features (B, 2, F, 99) relative to the object (B, F, 10): wrist and global rotation; fingers unchanged."""
+    """Hand features (B, 2, F, 99) relative to the object (B, F, 10): wrist and global rotation change."""
     rotation, position = object_rotmat(objects)[:, None], object_position_m(objects)[:, None]
     return _moved(hands, rotation.transpose(-1, -2), position)
 
@@ -117,30 +117,32 @@ def hands_in_object_frame(hands: Tensor, objects: Tensor) -> Tensor:
 def hands_in_world(hands: Tensor, objects: Tensor) -> Tensor:
     """The inverse of :func:`hands_in_object_frame`."""
     rotation, position = object_rotmat(objects)[:, None], object_position_m(objects)[:, None]
-    back = -(position[..., None, :] @ rotation)[..., 0, :]
-    return _moved(hands, rotation, back)
+    inverse_origin = -(position[..., None, :] @ rotation)[..., 0, :]
+    return _moved(hands, rotation, inverse_origin)
 
 
 def _moved(hands: Tensor, rotation: Tensor, origin: Tensor) -> Tensor:
-    """Wrist and global 6D turned by ``rotation`` about ``origin``."""
+    """Rotate wrist and global 6D by ``rotation`` about ``origin``."""
     wrist = (rotation @ (hands[..., WRIST] - origin)[..., None])[..., 0]
+    # A 6D rotation is two columns of a matrix, stored by row.
     columns = rotation @ hands[..., GLOBAL_ORIENT_6D].unflatten(-1, (3, 2))
     return torch.cat((wrist, columns.flatten(-2), hands[..., HAND_POSE_6D]), -1)
 
 
 def place_points(batch: RequestBatch, objects: Tensor) -> Tensor:
-    """The sampled object points at each pose (B, F, 10): (B, F, 1024, 3), the moving part turned about its hinge."""
-    turn = rotvec_to_rotmat(batch.hinge_axis[:, None] * object_hinge_rad(objects)[..., None])
+    """Object points (B, F, 1024, 3) at each pose (B, F, 10), with the moving part rotated about its hinge."""
+    hinge_rotmat = rotvec_to_rotmat(batch.hinge_axis[:, None] * object_hinge_rad(objects)[..., None])
     origin = batch.hinge_origin_m[:, None, None]
     still = batch.points_m[:, None].expand(-1, objects.shape[1], -1, -1)
-    moved = (still - origin) @ turn.transpose(-1, -2) + origin
+    moved = (still - origin) @ hinge_rotmat.transpose(-1, -2) + origin
+    # Only part 1 of an articulated object moves with the hinge.
     moves = ((batch.part == 1) & batch.articulated[:, None])[:, None, :, None]
     articulated = torch.where(moves, moved, still)
     return articulated @ object_rotmat(objects).transpose(-1, -2) + object_position_m(objects)[..., None, :]
 
 
 class Hands(nn.Module):
-    """Both sides of a hand model as one layer over hand features; it has no weights of its own to learn."""
+    """Forward kinematics of both hands as a layer on hand features; without trainable weights."""
 
     def __init__(self, pair: HandPair) -> None:
         super().__init__()
@@ -148,15 +150,15 @@ class Hands(nn.Module):
         self.kinematics = nn.ModuleList([HandKinematics(pair[side]) for side in SIDES])
 
     def joints(self, hands: Tensor, betas: Tensor, template_m: Tensor | None = None) -> Tensor:
-        """(B, 2, F, 21, 3) joints, metres, of features (B, 2, F, 99); betas (B, 2, 10), template (B, 2, 778, 3)."""
+        """Joints (B, 2, F, 21, 3), metres, of features (B, 2, F, 99); betas (B, 2, 10), template (B, 2, 778, 3)."""
         sides = [self._arguments(hands, betas, template_m, side) for side in range(2)]
-        joints = [layer.joints(*given) for layer, given in zip(self._layers(), sides, strict=True)]
+        joints = [layer.joints(*arguments) for layer, arguments in zip(self._layers(), sides, strict=True)]
         return torch.stack([side.reshape(len(hands), hands.shape[2], 21, 3) for side in joints], 1)
 
     def vertices(self, hands: Tensor, betas: Tensor, template_m: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """(B, 2, F, 778, 3) vertices and (B, 2, F, 21, 3) joints; arguments as in ``joints``."""
+        """Vertices (B, 2, F, 778, 3) and joints (B, 2, F, 21, 3), metres; arguments as in ``joints``."""
         sides = [self._arguments(hands, betas, template_m, side) for side in range(2)]
-        both = [layer(*given) for layer, given in zip(self._layers(), sides, strict=True)]
+        both = [layer(*arguments) for layer, arguments in zip(self._layers(), sides, strict=True)]
         shape = (len(hands), hands.shape[2], -1, 3)
         vertices, joints = zip(*[(mesh.reshape(shape), joint.reshape(shape)) for mesh, joint in both], strict=True)
         return torch.stack(vertices, 1), torch.stack(joints, 1)
@@ -167,43 +169,44 @@ class Hands(nn.Module):
     def _arguments(self, hands: Tensor, betas: Tensor, template_m: Tensor | None, side: int) -> tuple:
         flat = hands[:, side].reshape(-1, HAND_FEATURES)
         n_frames = hands.shape[2]
-        own_betas = betas[:, side].repeat_interleave(n_frames, 0)
+        frame_betas = betas[:, side].repeat_interleave(n_frames, 0)
         template = None if template_m is None else template_m[:, side].repeat_interleave(n_frames, 0)
-        return hand_wrist_m(flat), hand_rotmats(flat), own_betas, template
+        return hand_wrist_m(flat), hand_rotmats(flat), frame_betas, template
 
 
 @dataclass(frozen=True)
 class Normaliser:
-    """Mean and spread of every feature over the training frames: hand (2, 99) by side, object (10,) or (16,)."""
+    """Mean and standard deviation of every feature over the training frames."""
 
-    hand_mean: Tensor
-    hand_scale: Tensor
-    object_mean: Tensor
-    object_scale: Tensor
+    hand_mean: Tensor  # (2, 99), by hand
+    hand_scale: Tensor  # (2, 99)
+    object_mean: Tensor  # (10,) or (16,)
+    object_scale: Tensor  # (10,) or (16,)
 
     @classmethod
     def of(cls, clips: Sequence[tuple[Tensor, Tensor, Tensor]]) -> "Normaliser":
-        """From rows of training clips: hands (2, K, 99), object (L, 10), present (2, K); absent hands are left out."""
+        """From training clips: hands (2, K, 99), object (L, 10 or 16), present (2, K); absent hands are skipped."""
         means, scales = np.zeros((2, HAND_FEATURES)), np.ones((2, HAND_FEATURES))
         for side in range(2):
-            means[side], scales[side] = _moments([own[side][there[side]] for own, _, there in clips], HAND_FEATURES)
-        objects = [own for _, own, _ in clips]
+            hands = [hand[side][present[side]] for hand, _, present in clips]
+            means[side], scales[side] = _moments(hands, HAND_FEATURES)
+        objects = [points for _, points, _ in clips]
         object_mean, object_scale = _moments(objects, objects[0].shape[-1] if objects else OBJECT_FEATURES)
         arrays = (means, scales, object_mean, object_scale)
         return cls(*(torch.from_numpy(np.asarray(array, dtype=np.float32)) for array in arrays))
 
     @classmethod
-    def nothing(cls, object_features: int = OBJECT_FEATURES) -> "Normaliser":
-        """Leaves features as they are: metres and numbers."""
+    def identity(cls, object_features: int = OBJECT_FEATURES) -> "Normaliser":
+        """A normaliser that does not change features."""
         shapes = (2, HAND_FEATURES), (object_features,)
         return cls(torch.zeros(shapes[0]), torch.ones(shapes[0]), torch.zeros(shapes[1]), torch.ones(shapes[1]))
 
-    def spread_to(self, spread: float) -> "Normaliser":
-        """The same means; features come out as wide as ``spread``, not 1."""
-        return replace(self, hand_scale=self.hand_scale / spread, object_scale=self.object_scale / spread)
+    def scaled_to(self, deviation: float) -> "Normaliser":
+        """A normaliser that scales features to this standard deviation instead of 1."""
+        return replace(self, hand_scale=self.hand_scale / deviation, object_scale=self.object_scale / deviation)
 
     def encode(self, hands: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
-        """Features (B, 2, F, 99) and (B, F, 10) to zero mean and unit spread."""
+        """Features (B, 2, F, 99) and (B, F, 10) to zero mean and unit deviation."""
         hands = (hands - self.hand_mean[:, None]) / self.hand_scale[:, None]
         return hands, (objects - self.object_mean) / self.object_scale
 
@@ -213,21 +216,22 @@ class Normaliser:
         return hands, objects * self.object_scale + self.object_mean
 
     def to(self, device: torch.device | str) -> "Normaliser":
-        """The same numbers on ``device``."""
+        """A copy on ``device``."""
         return Normaliser(*(tensor.to(device) for tensor in self.tensors().values()))
 
     def tensors(self) -> dict[str, Tensor]:
-        """The four tensors by field name, to store in a checkpoint."""
+        """The four tensors with their field names, to store in a checkpoint."""
         return {name: getattr(self, name) for name in ("hand_mean", "hand_scale", "object_mean", "object_scale")}
 
 
 def _moments(frames: list[Tensor], size: int) -> tuple[np.ndarray, np.ndarray]:
-    rows = torch.cat([torch.zeros(0, size), *frames]).double().numpy()
-    if not len(rows):
+    """Mean and standard deviation (size,) over frames (frame, size)."""
+    values = torch.cat([torch.zeros(0, size), *frames]).double().numpy()
+    if not len(values):
         return np.zeros(size), np.ones(size)
-    scale = rows.std(axis=0)
-    turns = (OBJECT_ROTATION_6D, OBJECT_START_6D)[: 2 if size == OBJECT_START_6D.stop else 1]
-    for group in (WRIST,) if size == HAND_FEATURES else (OBJECT_POSITION, *turns):
-        # One scale per position (and per object rotation) keeps directions comparable.
+    scale = values.std(axis=0)
+    rotations = (OBJECT_ROTATION_6D, OBJECT_START_6D)[: 2 if size == OBJECT_START_6D.stop else 1]
+    for group in (WRIST,) if size == HAND_FEATURES else (OBJECT_POSITION, *rotations):
+        # One scale per position, and per object rotation, keeps directions comparable.
         scale[group] = np.sqrt((scale[group] ** 2).mean())
-    return rows.mean(axis=0), np.maximum(scale, SMALLEST_SCALE)
+    return values.mean(axis=0), np.maximum(scale, SMALLEST_SCALE)

@@ -1,4 +1,4 @@
-"""Losses of generator and refiner: Text2HOI eq. 5-7 and 9-11, as means over what is present.
+"""Losses of generator and refiner (Text2HOI, Eq. 5-7 and 9-11), as means over valid frames.
 
 All geometry is in metres in the model frame. Distances to surfaces come from
 ``hoidata.objects.signed_distance_grid``, whose gradient reaches the query points only. Masks are 0/1 tensors; an empty
@@ -17,32 +17,33 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def distance_map_loss(joints_m: Tensor, points_m: Tensor, entries: Tensor, distance_m: Tensor) -> Tensor:
-    """Eq. 6: squared error of the joint-to-point distances listed in the truth, in metres.
+    """Text2HOI, Eq. 6: squared error of the recorded joint-to-point distances, in metres.
 
     joints_m (B, 2, F, 21, 3), points_m (B, F, 1024, 3), entries (entry, 5): clip, side, frame, joint, point.
     """
     if not len(entries):
         return joints_m.sum() * 0
     clip, side, frame, joint, point = entries.unbind(1)
-    apart = joints_m[clip, side, frame, joint] - points_m[clip, frame, point]
-    predicted = (apart.square().sum(-1) + 1e-10).sqrt()
+    offset = joints_m[clip, side, frame, joint] - points_m[clip, frame, point]
+    # The small constant keeps the gradient finite at distance zero.
+    predicted = (offset.square().sum(-1) + 1e-10).sqrt()
     return (predicted - distance_m).square().mean()
 
 
 def joint_loss(joints_m: Tensor, true_m: Tensor, mask: Tensor, weight: Tensor, scale_m: float = 0.01) -> Tensor:
-    """Distance of joints (B, 2, F, 21, 3) from the true ones in units of ``scale_m``: squared below one, linear beyond.
+    """Huber loss of joints (B, 2, F, 21, 3) and recorded joints ``true_m``, in units of ``scale_m``.
 
     mask (B, 2, F); weight (B, 2, F, 21) of each joint. Both in one frame, metres.
     """
-    apart = (joints_m - true_m) / scale_m
-    huber = functional.huber_loss(apart, torch.zeros_like(apart), reduction="none").sum(-1)
+    error = (joints_m - true_m) / scale_m
+    huber = functional.huber_loss(error, torch.zeros_like(error), reduction="none").sum(-1)
     return (huber * weight * mask[..., None]).sum() / (weight * mask[..., None]).sum().clamp_min(1.0)
 
 
 def relative_orientation_loss(
     hand: Tensor, objects: Tensor, true_hand: Tensor, true_object: Tensor, mask: Tensor
 ) -> Tensor:
-    """Eq. 7: squared Frobenius distance of ``R_object^T R_hand`` to the true one, which no motion of the world changes.
+    """Text2HOI, Eq. 7: squared Frobenius error of ``R_object^T R_hand``, which does not depend on the world frame.
 
     hand (B, 2, F, 3, 3), object (B, F, 3, 3), mask (B, 2, F).
     """
@@ -52,7 +53,7 @@ def relative_orientation_loss(
 
 
 def penetration_loss(signed_distance_m: Tensor, mask: Tensor, scale_m: float = 0.01) -> Tensor:
-    """Eq. 10: squared depth of the hand vertices inside the object, summed over vertices, in units of ``scale_m``.
+    """Text2HOI, Eq. 10: squared depth of hand vertices inside the object, summed over vertices, in ``scale_m``.
 
     signed_distance_m (B, 2, F, V), negative inside; mask (B, 2, F).
     """
@@ -63,18 +64,18 @@ def penetration_loss(signed_distance_m: Tensor, mask: Tensor, scale_m: float = 0
 def contact_loss(
     distance_m: Tensor, true_distance_m: Tensor, mask: Tensor, threshold_m: float, scale_m: float = 0.01
 ) -> Tensor:
-    """Eq. 11: joints that touch (closer than ``threshold_m`` in the truth) come as near as they truly are.
+    """Text2HOI, Eq. 11: Huber error of touching joints' surface distances from the recorded ones.
 
-    Signed distances (B, 2, F, 21), mask (B, 2, F). A joint lies a finger's radius below its skin: pulling it onto the
-    surface itself, as the paper does, would push the skin inside. Squared up to 3 cm of error, linear beyond (Huber).
+    Signed distances (B, 2, F, 21), mask (B, 2, F). A joint is a finger's radius below its skin. Pulling it onto the
+    surface, as the paper does, would push the skin inside. Joints touch if they were recorded within ``threshold_m``.
     """
     near = touching_joints(true_distance_m, threshold_m) & (mask[..., None] > 0)
-    apart = (distance_m - true_distance_m) / scale_m
-    return masked_mean(2 * functional.huber_loss(apart, torch.zeros_like(apart), reduction="none", delta=3.0), near)
+    error = (distance_m - true_distance_m) / scale_m
+    return masked_mean(2 * functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=3.0), near)
 
 
 def surface_loss(distance_m: Tensor, mask: Tensor, threshold_m: float, scale_m: float = 1.0) -> Tensor:
-    """Eq. 11 as written: squared distances to the surface of the joints closer to it than ``threshold_m``.
+    """Text2HOI, Eq. 11 as written: squared surface distances of the joints closer than ``threshold_m``.
 
     Signed distances (B, 2, F, 21), mask (B, 2, F).
     """
@@ -83,11 +84,11 @@ def surface_loss(distance_m: Tensor, mask: Tensor, threshold_m: float, scale_m: 
 
 
 def touching_joints(distance_m: Tensor, threshold_m: float) -> Tensor:
-    """Joints closer than ``threshold_m`` to the surface, on either side of it."""
+    """Whether joints are within ``threshold_m`` of the surface, inside or outside."""
     return distance_m.abs() < threshold_m
 
 
 def take_frames(x: Tensor, chosen: Tensor, axis: int) -> Tensor:
-    """The chosen frames (B, K) of ``x``, whose frame axis is ``axis`` (1 or 2)."""
-    rows = torch.arange(len(x), device=x.device)[:, None]
-    return x[rows, chosen] if axis == 1 else x.transpose(1, 2)[rows, chosen].transpose(1, 2)
+    """The frames ``chosen`` (B, K) of ``x``; ``axis``, 1 or 2, is the frame axis."""
+    clip = torch.arange(len(x), device=x.device)[:, None]
+    return x[clip, chosen] if axis == 1 else x.transpose(1, 2)[clip, chosen].transpose(1, 2)

@@ -1,4 +1,4 @@
-"""PointNet (Qi et al. 2017), as Text2HOI's supplement lays it out (Tables S4 and S5): features of a cloud of points."""
+"""PointNet (Qi et al. 2017): features of a point cloud, with the layers of Text2HOI's supplement, Tables S4 and S5."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -10,18 +10,18 @@ from torch.nn import functional
 
 @dataclass(frozen=True)
 class PointNetConfig:
-    """Sizes; the defaults are the paper's. widths: the three per-point layers, the last is the length of F_obj.
+    """Sizes of the point network; the defaults are the paper's."""
 
-    heads: layers behind the maximum (of the alignment, and of the encoder of z). align: learn a matrix per cloud.
-    """
-
+    # Of the three per-point layers; the last is the length of F_obj.
     widths: tuple[int, int, int] = (64, 128, 1024)
+    # Of the layers behind the maximum, in the alignment and in the VAE's encoder.
     heads: tuple[int, int] = (512, 256)
+    # Predict a matrix per cloud that aligns its points.
     align: bool = True
 
 
 def normalised_points(points_m: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (B, N, 3) about their mean, divided by the largest distance from it, and that scale (B, 1), metres."""
+    """Points (B, N, 3) relative to their mean, in units of the farthest point's distance; the unit (B, 1), metres."""
     centred = points_m - points_m.mean(1, keepdim=True)
     scale = centred.norm(dim=-1).amax(1)
     return centred / scale[:, None, None], scale[:, None]
@@ -53,19 +53,19 @@ class PointLayer(nn.Module):
         self.linear, self.norm, self.activate = nn.Linear(inputs, outputs), nn.BatchNorm1d(outputs), activate
 
     def forward(self, x: Tensor) -> Tensor:
-        rows = self.linear(x).flatten(0, -2)
-        # One row has no spread of its own: a dataset of one clip is normalised with the running statistics.
-        rows = self.norm(rows) if len(rows) > 1 else self._with_running_statistics(rows)
-        x = rows.reshape(*x.shape[:-1], -1)
+        flat = self.linear(x).flatten(0, -2)
+        # Batch statistics of a single sample are undefined: a dataset of one clip uses the running statistics.
+        flat = self.norm(flat) if len(flat) > 1 else self._with_running_statistics(flat)
+        x = flat.reshape(*x.shape[:-1], -1)
         return x.relu() if self.activate else x
 
-    def _with_running_statistics(self, rows: Tensor) -> Tensor:
+    def _with_running_statistics(self, flat: Tensor) -> Tensor:
         norm = self.norm
-        return functional.batch_norm(rows, norm.running_mean, norm.running_var, norm.weight, norm.bias, eps=norm.eps)
+        return functional.batch_norm(flat, norm.running_mean, norm.running_var, norm.weight, norm.bias, eps=norm.eps)
 
 
 class _Alignment(nn.Module):
-    """The spatial transformer: a (C, C) matrix per clip that starts as the identity."""
+    """The spatial transformer: a (C, C) matrix per clip, initially the identity."""
 
     def __init__(self, channels: int, config: PointNetConfig) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Half the bits where the time is: Transformers and point networks in 16 bits, geometry and losses in float32."""
+"""Mixed precision: Transformers and point networks in 16 bits, geometry and losses in float32."""
 
 from typing import Any, Literal
 
@@ -9,12 +9,12 @@ from models.common.point_net import PointNet
 from models.common.transformer import Encoder
 
 Precision = Literal["float32", "bfloat16"]
-# float16 rounds to an eighth of what bfloat16 does; gradients would need scaling there, so it is for sampling alone.
+# float16 has eight times the precision of bfloat16, but gradients would need scaling: it is for sampling only.
 SamplingPrecision = Literal["float32", "bfloat16", "float16"]
 
 
 def compute_in(network: nn.Module, precision: SamplingPrecision) -> None:
-    """From now on these parts of ``network`` compute in ``precision`` (autocast) and give float32, as weights stay."""
+    """Make these parts of ``network`` compute in ``precision`` (autocast). Weights and outputs stay float32."""
     if precision == "float32":
         return
     for module in network.modules():
@@ -24,9 +24,9 @@ def compute_in(network: nn.Module, precision: SamplingPrecision) -> None:
 
 
 def _lowered(forward: Any, dtype: torch.dtype) -> Any:
-    def lowered(x: Tensor, *given: Any) -> Any:
+    def lowered(x: Tensor, *arguments: Any) -> Any:
         with torch.autocast(x.device.type, dtype):
-            found = forward(x, *given)
-        return found.float() if isinstance(found, Tensor) else tuple(own.float() for own in found)
+            outputs = forward(x, *arguments)
+        return outputs.float() if isinstance(outputs, Tensor) else tuple(output.float() for output in outputs)
 
     return lowered

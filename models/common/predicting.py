@@ -1,4 +1,4 @@
-"""The motions of a family for a dataset's test clips, written as an ordinary store of clips."""
+"""Samples a family's motions for a dataset's test clips, and writes them as a store of clips."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,27 +32,27 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class PredictionConfig:
-    """samples: motions for every test clip. seed: of all that is drawn. clips: evenly spread test clips; 0: all."""
+    """How many motions are sampled."""
 
-    samples: int = 8
-    seed: int = 0
-    clips: int = 0
+    samples: int = 8  # per test clip
+    seed: int = 0  # of all random numbers
+    clips: int = 0  # evenly spaced test clips; 0: all
 
     def __post_init__(self) -> None:
         at_least("sample", self, "samples", 1)
         at_least("sample", self, "clips", 0)
 
 
-# (point,) bool, the sampled points to be touched; or how far hands are to be; or None where nothing was asked.
-AskedMap = np.ndarray | AskedDistances | None
+# The contact that a motion was conditioned on: (point,) bool touched points, distances to the hands, or None.
+ContactCondition = np.ndarray | AskedDistances | None
 
 
 @runtime_checkable
-class AsksContact(Protocol):
-    """A family ready to answer that decides where the object is to be touched, and can say so."""
+class ReportsContact(Protocol):
+    """A sampler that conditions motions on contact and reports it."""
 
-    def sample_asked(self, requests: Sequence[Request]) -> tuple[Sequence[Clip | LeftOut], Sequence[AskedMap]]:
-        """As ``Sampler.sample``, and of each motion the map it was made for, which :data:`AskedMap` describes."""
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[Sequence[Clip | LeftOut], Sequence[ContactCondition]]:
+        """As ``Sampler.sample``, with the contact that each motion was conditioned on (:data:`ContactCondition`)."""
         ...
 
 
@@ -67,14 +67,21 @@ def sample_family(
     settings: Mapping[str, Any] | None = None,
     device: str = "cpu",
 ) -> dict[str, int]:
-    """Write ``out/clips`` and ``out/diagnostics.json``, or ``out/empty.json`` with the reason; the counts.
+    """Sample a family's motions for the test clips.
 
-    Requests the family has no answer to stand in ``out/left_out.json``, where there are any. A family that is
-    :class:`AsksContact` also gets ``out/asked.npz`` or ``out/asked-distances.npz`` (``hoidata.metrics.asked``).
-    annotated_root: clips, annotation, contact and splits of a dataset. checkpoints: folder with one per network.
-    params: a :class:`PredictionConfig`; settings: sections of families, by name. The k-th
-    motion for a clip is named ``<clip id>~<k>``; lengths and acting hands are the clip's own, of clips longer than a
-    model takes the first frames.
+    Writes ``out/clips`` and ``out/diagnostics.json``, or ``out/empty.json`` with the reason. Skipped requests are
+    listed in ``out/left_out.json``. A family that is :class:`ReportsContact` also gets ``out/asked.npz`` or
+    ``out/asked-distances.npz`` (``hoidata.metrics.asked``). Motion k for a clip is named ``<clip id>~<k>``. Length and
+    hand type are those of the recorded clip; of a clip that is too long, the first frames count.
+
+    Args:
+        annotated_root: folder with clips, annotation, contact and splits of a dataset.
+        checkpoints: folder with one checkpoint folder per network.
+        params: a :class:`PredictionConfig`.
+        settings: section of params.yaml by family.
+
+    Returns:
+        Counts of the store.
     """
     config = build_config(PredictionConfig, params, "params.yaml: sample")
     root, checkpoints = Path(annotated_root), Path(checkpoints)
@@ -86,17 +93,17 @@ def sample_family(
         with atomic_folder(out) as partial:
             write_empty(partial, reason or "no test clips")
         return {"clips": 0}
-    sources = Sources(annotated, checkpoints, hands, torch.device(device), settings or {})
+    sources = Sources(annotated, checkpoints, hands, device=torch.device(device), settings=settings or {})
     with atomic_folder(out) as partial:
         info = annotated.info | {"family": family.name, "sampling_device": sources.device.type}
-        left_out, asked = list[LeftOut](), dict[str, np.ndarray | AskedDistances]()
-        motions = _made(_motions(family.load(sources), test, config, asked), left_out)
+        left_out, contacts = list[LeftOut](), dict[str, np.ndarray | AskedDistances]()
+        motions = _motions_of(_motions(family.load(sources), test, config, contacts), left_out)
         first = next(motions, None)
         if first is None:
             write_empty(partial, f"no motion of {len(left_out)}: {left_out[0].reason}")
             return {"clips": 0}
         counts = write_store(partial / "clips", chain([first], motions), info)
-        _write_asked(partial, asked)
+        _write_asked(partial, contacts)
         _write(partial / "diagnostics.json", family.diagnose(sources))
         if left_out:
             _write(partial / LEFT_OUT, [asdict(item) for item in left_out])
@@ -104,17 +111,14 @@ def sample_family(
 
 
 def spread(items: Sequence[Item], count: int) -> list[Item]:
-    """So many of them, evenly spread; all where there are no more, or for 0."""
+    """``count`` evenly spaced items; all if there are fewer, or for 0."""
     count = min(count or len(items), len(items))
     return [items[number * len(items) // count] for number in range(count)]
 
 
 def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
-    """What is asked of a family in place of a recorded clip: as often as the config says, each with its own seed.
-
-    A motion's seed does not depend on which other clips there are.
-    """
-    given = Trajectories(sample.hands[..., : GLOBAL_ORIENT_6D.stop], sample.valid, sample.object)
+    """Requests for ``config.samples`` motions in place of a recorded clip; seeds do not depend on other clips."""
+    trajectories = Trajectories(sample.hands[..., : GLOBAL_ORIENT_6D.stop], sample.valid, sample.object)
     return [
         Request(
             motion_id=f"{sample.clip_id}~{number}",
@@ -132,21 +136,21 @@ def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
             template_m=sample.template_m,
             world_from_model=sample.world_from_model,
             gravity_known=sample.gravity_known,
-            trajectories=given,
+            trajectories=trajectories,
         )
         for number in range(config.samples)
     ]
 
 
 def first_sentence(sample: ClipSample) -> Sentence:
-    """The imperative of a clip, whose features are the first."""
+    """The first sentence of a clip, an imperative."""
     return Sentence(sample.sentences[0], sample.verb, sample.object_words or None)
 
 
-def _write_asked(folder: Path, asked: Mapping[str, np.ndarray | AskedDistances]) -> None:
-    """The maps motions were made for, each kind in its file; none where there are none."""
-    distances = {name: own for name, own in asked.items() if isinstance(own, AskedDistances)}
-    if touched := {name: own for name, own in asked.items() if isinstance(own, np.ndarray)}:
+def _write_asked(folder: Path, contacts: Mapping[str, np.ndarray | AskedDistances]) -> None:
+    """Write the contact conditions, each kind to its file, if there are any."""
+    distances = {name: contact for name, contact in contacts.items() if isinstance(contact, AskedDistances)}
+    if touched := {name: contact for name, contact in contacts.items() if isinstance(contact, np.ndarray)}:
         write_asked(folder, touched)
     if distances:
         write_asked_distances(folder, distances)
@@ -156,8 +160,8 @@ def _write(path: Path, values: Any) -> None:
     write_whole(path, json.dumps(values, indent=2, sort_keys=True) + "\n")
 
 
-def _made(answers: Iterator[Clip | LeftOut], left_out: list[LeftOut]) -> Iterator[Clip]:
-    """The motions among the answers; the others are added to ``left_out``."""
+def _motions_of(answers: Iterator[Clip | LeftOut], left_out: list[LeftOut]) -> Iterator[Clip]:
+    """The motions among the answers; skipped requests are appended to ``left_out``."""
     for answer in answers:
         if isinstance(answer, LeftOut):
             left_out.append(answer)
@@ -169,23 +173,27 @@ def _motions(
     sampler: Sampler,
     test: Sequence[ClipSample],
     config: PredictionConfig,
-    asked: dict[str, np.ndarray | AskedDistances],
+    contacts: dict[str, np.ndarray | AskedDistances],
 ) -> Iterator[Clip | LeftOut]:
-    """The answers in order; ``asked`` is filled with the contact map of each, where the family has them."""
+    """The answers in order; adds each motion's contact condition, if the family reports it, to ``contacts``."""
     starts = range(0, len(test), CLIPS_AT_ONCE)
     for start in track(starts, description="sampling", transient=True):
         chosen = test[start : start + CLIPS_AT_ONCE]
         requests = [request for sample in chosen for request in requests_for(sample, config)]
-        if isinstance(sampler, AsksContact):
+        if isinstance(sampler, ReportsContact):
             answers, maps = sampler.sample_asked(requests)
-            asked |= {answer.clip_id: own for answer, own in zip(answers, maps, strict=True) if own is not None}
+            contacts |= {
+                answer.clip_id: contact_map
+                for answer, contact_map in zip(answers, maps, strict=True)
+                if contact_map is not None
+            }
         else:
             answers = sampler.sample(requests)
         yield from answers
 
 
 def _why_not(family: Family, root: Path, checkpoints: Path) -> str | None:
-    """What is missing: an empty dataset, or a network the family uses."""
+    """The reason why nothing can be sampled: an empty dataset, or a missing network."""
     folders = [root / "clips", root / "annotation", root / "contact", *(checkpoints / name for name in family.uses)]
     if reason := next(filter(None, map(empty_reason, folders)), None):
         return reason

@@ -1,4 +1,4 @@
-"""What a training keeps so that a killed one goes on: one safetensors file and its log, outside of its output."""
+"""The state from which a killed training resumes: a safetensors file and the log, outside of its output folder."""
 
 import csv
 import json
@@ -19,69 +19,62 @@ from torch import Tensor, nn
 from hoidata.files import atomic_file, remove_dead_leftovers, write_whole
 
 STATE_NAME, LOG_NAME = "state.safetensors", "log.csv"
-# Seconds between two saves, and how many times longer than the last save they are at least: saving a large network
-# takes at most a fiftieth of the time.
-SAVE_AFTER_S, SAVE_SHARE = 10.0, 50
+# Seconds between two saves, and the least multiple of the last save's duration: saving takes at most 1/50 of the time.
+SAVE_AFTER_S, SAVE_INTERVAL_FACTOR = 10.0, 50
 Row = dict[str, float | None]
 WEIGHTS = "weights that are not finite"
 
 
 class Diverged(Exception):
-    """A training met a number that is not finite, so no further step can help.
+    """A loss or a weight is not finite, so further steps cannot help."""
 
-    step: of the training. what: the quantity, for instance "a loss of nan". state: the training at that moment.
-    """
-
-    def __init__(self, step: int, what: str, state: "State") -> None:
-        super().__init__(f"{what} at step {step}")
-        self.step, self.what, self.state = step, what, state
+    def __init__(self, step: int, quantity: str, state: "State") -> None:
+        """quantity: for instance "a loss of nan". state: the training at that moment."""
+        super().__init__(f"{quantity} at step {step}")
+        self.step, self.quantity, self.state = step, quantity, state
 
 
 @dataclass
 class State:
-    """Where a training stands after ``step``; with (seed, step) it is all that the next step depends on.
-
-    kept: running average of the network's weights. best: weights at the lowest validation loss, ``best_loss``.
-    log: a row per validation. running: losses added up since the last row, over the team.
-    """
+    """The state of a training after ``step``; together with seed and step it determines the next step."""
 
     network: nn.Module
-    kept: nn.Module
+    ema_network: nn.Module  # running average of the weights
     optimiser: torch.optim.Optimizer
     step: int = 0
-    best: dict[str, Tensor] = field(default_factory=dict)
+    best: dict[str, Tensor] = field(default_factory=dict)  # weights at the lowest validation loss
     best_loss: float = math.inf
-    log: list[Row] = field(default_factory=list)
-    running: dict[str, Tensor] = field(default_factory=dict)
+    log: list[Row] = field(default_factory=list)  # one entry per validation
+    running: dict[str, Tensor] = field(default_factory=dict)  # sums of losses since the last entry, over the team
 
     def tensors(self) -> dict[str, Tensor]:
-        """All of it that is tensors, by name."""
+        """All tensors of the state: names to values."""
         groups: dict[str, Mapping[str, Tensor]] = {
             "network": self.network.state_dict(),
-            "kept": self.kept.state_dict(),
+            "kept": self.ema_network.state_dict(),
             "best": self.best,
             "running": self.running,
-            "optimiser": {f"{row}.{name}": value for row, name, value in self._moments()},
+            "optimiser": {f"{number}.{name}": value for number, name, value in self._moments()},
         }
         return {f"{group}/{name}": value for group, named in groups.items() for name, value in named.items()}
 
     def _moments(self) -> Iterator[tuple[int, str, Tensor]]:
-        for row, values in self.optimiser.state_dict()["state"].items():
+        for number, values in self.optimiser.state_dict()["state"].items():
             for name, value in values.items():
-                yield row, name, value
+                yield number, name, value
 
     def restore(self, tensors: Mapping[str, Tensor], numbers: Mapping[str, Any]) -> None:
         """The inverse of ``tensors``; numbers: step, best_loss and log."""
         groups: dict[str, dict[str, Tensor]] = {}
         for name, value in tensors.items():
-            group, _, own = name.partition("/")
-            groups.setdefault(group, {})[own] = value
+            group, _, name_in_group = name.partition("/")
+            groups.setdefault(group, {})[name_in_group] = value
         self.network.load_state_dict(groups["network"])
-        self.kept.load_state_dict(groups["kept"])
+        self.ema_network.load_state_dict(groups["kept"])
         moments: dict[int, dict[str, Tensor]] = {}
         for name, value in groups.get("optimiser", {}).items():
-            row, _, own = name.partition(".")
-            moments.setdefault(int(row), {})[own] = value
+            number, _, moment = name.partition(".")
+            moments.setdefault(int(number), {})[moment] = value
         self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": moments})
         device = next(iter(self.network.state_dict().values())).device
         self.best = {name: value.to(device) for name, value in groups.get("best", {}).items()}
@@ -92,23 +85,19 @@ class State:
 
 @dataclass
 class Progress:
-    """folder: of this training alone. digest: of everything it is made from; a state of another is not taken up.
+    """Saves and restores the state of one training."""
 
-    writes: whether this process is the one of its team that writes. next_save_s: when time alone is a reason to save,
-    by the clock ``time.monotonic``.
-    """
-
-    folder: Path
-    digest: str
-    writes: bool = True
-    next_save_s: float = field(default_factory=lambda: time.monotonic() + SAVE_AFTER_S)
+    folder: Path  # of this training only
+    digest: str  # of all inputs of the training; a state with another digest is not restored
+    writes: bool = True  # whether this process of the team writes
+    next_save_s: float = field(default_factory=lambda: time.monotonic() + SAVE_AFTER_S)  # by ``time.monotonic``
 
     @property
     def state_file(self) -> Path:
         return self.folder / STATE_NAME
 
     def load(self, state: State) -> None:
-        """Go on from what was saved; where it belongs to another training, or cannot be read, start anew and say so."""
+        """Restore the saved state; start from scratch if it cannot be read or is of another training."""
         if self.writes:
             remove_dead_leftovers(self.state_file)
             remove_dead_leftovers(self.folder / LOG_NAME)
@@ -116,47 +105,47 @@ class Progress:
             return
         try:
             if self.read(state):
-                return self._say(f"goes on after step {state.step}")
+                return self._report(f"resumes after step {state.step}")
         except (OSError, SafetensorError, KeyError, ValueError) as error:
-            return self._say(f"starts anew: {self.state_file} cannot be read ({type(error).__name__})")
-        self._say(f"starts anew: {self.state_file} is of other settings, data or code")
+            return self._report(f"starts from scratch: {self.state_file} cannot be read ({type(error).__name__})")
+        self._report(f"starts from scratch: {self.state_file} is of other settings, data or code")
 
     def read(self, state: State) -> bool:
-        """Restore what was saved; False where it belongs to another training."""
+        """Restore the saved state; False if it belongs to another training."""
         with safe_open(self.state_file, framework="pt") as stored:
             numbers = json.loads((stored.metadata() or {})["hoidata"])
             if is_same := numbers["digest"] == self.digest:
                 state.restore({name: stored.get_tensor(name) for name in stored.keys()}, numbers)  # noqa: SIM118
         return is_same
 
-    def keep(self, state: State, every: int) -> None:
-        """After a step: the log where it has grown, and everything after ``every`` steps or when it is time."""
+    def save_if_due(self, state: State, interval: int) -> None:
+        """After a step: write the log if it has grown; save the state every ``interval`` steps, or sooner by time."""
         if self.writes and state.log and state.log[-1]["step"] == state.step:
             write_log(self.folder / LOG_NAME, state.log)
-        if self.writes and (state.step % every == 0 or time.monotonic() >= self.next_save_s):
+        if self.writes and (state.step % interval == 0 or time.monotonic() >= self.next_save_s):
             start = time.monotonic()
             self.save(state)
-            took = time.monotonic() - start
-            self.next_save_s = start + took + max(SAVE_AFTER_S, SAVE_SHARE * took)
+            duration_s = time.monotonic() - start
+            self.next_save_s = start + duration_s + max(SAVE_AFTER_S, SAVE_INTERVAL_FACTOR * duration_s)
 
     def save(self, state: State) -> None:
-        """Everything, whole or not at all. Raises Diverged where a weight is no finite number: none such is kept."""
+        """Save the whole state atomically. Raises Diverged instead if a weight is not finite."""
         best_loss = None if math.isinf(state.best_loss) else state.best_loss
         numbers = {"digest": self.digest, "step": state.step, "best_loss": best_loss}
         numbers["losses"] = list(state.running)  # in the order of the log's columns
         tensors = {name: value.detach().cpu().contiguous() for name, value in sorted(state.tensors().items())}
         if not all_finite(tensors):
             raise Diverged(state.step, WEIGHTS, state)
-        metadata = {"hoidata": json.dumps({**numbers, "log": state.log})}  # losses may be no number
+        metadata = {"hoidata": json.dumps({**numbers, "log": state.log})}  # losses may be NaN
         write_whole(self.state_file, save(tensors, metadata=metadata))
 
     def clear(self) -> None:
-        """Nothing is left to go on with."""
+        """Remove the saved state."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def _say(self, what: str) -> None:
+    def _report(self, message: str) -> None:
         if self.writes:
-            print(f"training in {self.folder} {what}", file=sys.stderr)
+            print(f"training in {self.folder} {message}", file=sys.stderr)
 
 
 def all_finite(tensors: Mapping[str, Tensor]) -> bool:
@@ -165,8 +154,10 @@ def all_finite(tensors: Mapping[str, Tensor]) -> bool:
 
 
 def write_log(path: Path, log: list[Row]) -> None:
-    """log.csv: step, validation loss (empty without validation clips), mean training losses since the row before."""
+    """Write log.csv: step, validation loss, mean training losses since the previous line; empty if not known."""
     with atomic_file(path) as partial, open(partial, "w", newline="") as stream:
         writer = csv.DictWriter(stream, list(log[0]), lineterminator="\n")
         writer.writeheader()
-        writer.writerows({name: "" if value is None else f"{value:.6g}" for name, value in row.items()} for row in log)
+        writer.writerows(
+            {name: "" if value is None else f"{value:.6g}" for name, value in entry.items()} for entry in log
+        )

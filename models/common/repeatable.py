@@ -1,4 +1,4 @@
-"""Equal inputs, equal bytes: what a process sets once for itself, and the draws of one step from their own seed."""
+"""Reproducible results: deterministic algorithms for a process, seeds for a step, and the choice of a device."""
 
 import os
 from collections.abc import Iterator
@@ -11,30 +11,30 @@ from hoidata.errors import BadInput, MissingResource
 
 
 def make_repeatable(threads: int) -> None:
-    """Fix, for the whole process, what could change bytes from run to run: threads and algorithms.
+    """Make the whole process deterministic: number of threads and algorithms.
 
-    For the entry of a process that trains or samples alone: a stage, a command, a worker. The library never calls it.
-    Matrix products stay float32 where a processor would be faster in bfloat16 (AMX): sampled motions would shake.
+    For the entry point of a process, such as a stage, a command or a worker; the library never calls it. Matrix
+    products stay float32 on processors with bfloat16 units (AMX), because sampled motions would jitter.
     """
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # without it cuBLAS refuses deterministic products
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS refuses deterministic products otherwise
     torch.set_num_threads(threads)
-    # As use_deterministic_algorithms(True), which loads torch's compiler as well: a second of every command's start.
+    # Like use_deterministic_algorithms(True), which also loads torch's compiler and costs each command a second.
     torch.set_deterministic_debug_mode("error")
-    # Nothing here reads memory before writing it; filling it first would cost a seventh of the time.
-    setattr(torch.utils.deterministic, "fill_uninitialized_memory", False)  # noqa: B010 (pyright does not know it)
+    # No code reads uninitialised memory; filling it would cost a seventh of the time.
+    setattr(torch.utils.deterministic, "fill_uninitialized_memory", False)  # noqa: B010 (missing in torch's types)
     torch.set_float32_matmul_precision("highest")
 
 
 @contextmanager
-def own_draws(device: torch.device | str = "cpu") -> Iterator[None]:
-    """Inside, torch's global generators (weights, dropout) may be seeded; afterwards they are as they were."""
+def restored_rng(device: torch.device | str = "cpu") -> Iterator[None]:
+    """Restore torch's global random generators (weights, dropout) at the end of the ``with`` block."""
     device = torch.device(device)
     with torch.random.fork_rng([device] if device.type == "cuda" else [], enabled=True):
         yield
 
 
 def seed_draws(*words: int) -> torch.Generator:
-    """A CPU generator seeded by ``words``, for instance (seed, step, part); torch's global ones are seeded alike."""
+    """A CPU generator seeded by ``words``, such as (seed, step, part); seeds torch's global generators as well."""
     seed = int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> np.uint64(1))
     torch.manual_seed(seed)
     return torch.Generator().manual_seed(seed)
@@ -44,9 +44,9 @@ DEVICES = ("auto", "cpu", "cuda")
 
 
 def chosen_device(setting: str) -> str:
-    """``cuda`` or ``cpu``: auto takes a GPU where torch finds one.
+    """``cuda`` or ``cpu`` for the setting ``device``; auto is a GPU if torch finds one.
 
-    Raises BadInput for another word, and MissingResource where cuda is asked for and there is none.
+    Raises BadInput for another value, and MissingResource for cuda without a GPU.
     """
     if setting not in DEVICES:
         raise BadInput("params.yaml: device", " or ".join(DEVICES), repr(setting), "correct it")

@@ -1,9 +1,10 @@
-"""Noise schedule and samplers around any denoiser that predicts what is clean.
+"""Noise schedule and samplers for any denoiser that predicts the clean motion (x0-prediction).
 
-Text2HOI: 1,000 steps, cosine schedule (Nichol and Dhariwal 2021), x0-prediction. DDPM walks every step (Ho et al.
-2020); DDIM strides over them (Song et al. 2021); DPM-Solver++ (Lu et al. 2022, second order, multistep) needs fewer
-calls still. The schedule is plain numbers: no step waits for a device. A denoiser of motions is
-``x0 = denoise(x_t, t)`` on a pair (hands, object).
+Text2HOI has 1,000 steps and a cosine schedule (Nichol and Dhariwal 2021). Samplers: DDPM takes every step (Ho et al.
+2020), DDIM skips steps (Song et al. 2021), and second-order multistep DPM-Solver++ (Lu et al. 2022) needs even fewer.
+The schedule is plain numbers, so that no step waits for a GPU.
+
+A denoiser of motions is ``x0 = denoise(x_t, t)`` on a pair (hands, object).
 """
 
 import math
@@ -27,72 +28,74 @@ Denoise = Callable[[Tensor, Tensor, Tensor], Motion]
 
 @dataclass(frozen=True)
 class SamplerConfig:
-    """kind: "ddim" and "dpm++" are deterministic after the first noise, "ddpm" is not. steps: denoiser calls.
+    """The sampler and its effort. Raises BadInput for values out of range."""
 
-    guidance: scale of classifier-free guidance; 1 is none. Raises BadInput for steps that are not there.
-    """
-
-    kind: Kind = "ddim"
-    steps: int = 20
-    guidance: float = 1.0
+    kind: Kind = "ddim"  # "ddim" and "dpm++" are deterministic given the initial noise, "ddpm" is not
+    steps: int = 20  # denoiser calls, 1 to 1,000
+    guidance: float = 1.0  # scale of classifier-free guidance; 1: none
 
     def __post_init__(self) -> None:
         if not (1 <= self.steps <= TRAIN_STEPS and math.isfinite(self.guidance)):
-            wanted, got = f"1 to {TRAIN_STEPS} steps, a finite guidance", f"{self.steps}, {self.guidance:g}"
-            raise BadInput("sampler", wanted, got, "correct steps, or guidance (--scale)")
+            expected, got = f"1 to {TRAIN_STEPS} steps, a finite guidance", f"{self.steps}, {self.guidance:g}"
+            raise BadInput("sampler", expected, got, "correct steps, or guidance (--scale)")
 
 
 @cache
-def signal_shares() -> tuple[float, ...]:
-    """Cumulative signal share of each of the 1,000 steps: alpha-bar of Ho et al. 2020, betas at most 0.999."""
+def alpha_bar_values() -> tuple[float, ...]:
+    """Alpha-bar (Ho et al. 2020), the fraction of signal variance, at each of the 1,000 steps; betas at most 0.999."""
     curve = [math.cos((step / TRAIN_STEPS + 0.008) / 1.008 * math.pi / 2) ** 2 for step in range(TRAIN_STEPS + 1)]
-    shares, share = [], 1.0
+    alpha_bars, alpha_bar = [], 1.0
     for step in range(TRAIN_STEPS):
-        share *= max(curve[step + 1] / curve[step], 0.001)
-        shares.append(share)
-    return tuple(shares)
+        # 1 - beta of this step; the bound keeps beta at most 0.999.
+        alpha_bar *= max(curve[step + 1] / curve[step], 0.001)
+        alpha_bars.append(alpha_bar)
+    return tuple(alpha_bars)
 
 
 def alphas_cumprod(device: torch.device | str = "cpu") -> Tensor:
-    """(1000,) float32 of :func:`signal_shares`."""
-    return torch.tensor(signal_shares()).to(device)
+    """(1000,) float32 of :func:`alpha_bar_values`."""
+    return torch.tensor(alpha_bar_values()).to(device)
 
 
 def timesteps(steps: int) -> list[int]:
-    """The steps that are walked: from the last of the 1,000 down, evenly ("trailing", Lin et al. 2024)."""
+    """The timesteps of a sampler: evenly spaced from the last of 1,000 down ("trailing", Lin et al. 2024)."""
     return [round(TRAIN_STEPS * (1 - number / steps)) - 1 for number in range(steps)]
 
 
-def add_noise(clean: Tensor, noise: Tensor, steps: Tensor, signal: Tensor) -> Tensor:
-    """The noised motion at steps (B,): Text2HOI eq. 1. ``signal`` is :func:`alphas_cumprod`."""
-    share = signal[steps].reshape(-1, *[1] * (clean.ndim - 1))
-    return share.sqrt() * clean + (1 - share).sqrt() * noise
+def add_noise(clean: Tensor, noise: Tensor, steps: Tensor, alphas_bar: Tensor) -> Tensor:
+    """Noise a clean motion to ``steps`` (B,) (Text2HOI, Eq. 1). ``alphas_bar`` (1000,) is :func:`alphas_cumprod`."""
+    alpha_bar = alphas_bar[steps].reshape(-1, *[1] * (clean.ndim - 1))
+    return alpha_bar.sqrt() * clean + (1 - alpha_bar).sqrt() * noise
 
 
 def draw_motion(hands_shape: tuple[int, ...], object_shape: tuple[int, ...], generator: torch.Generator) -> Motion:
-    """Noise of the given shapes (B, ...) from one generator, a row after the other."""
+    """Noise of the given shapes (B, ...) from one generator, one motion after the other."""
     sizes = [math.prod(shape[1:]) for shape in (hands_shape, object_shape)]
     return _unflatten(torch.randn(hands_shape[0], sum(sizes), generator=generator), hands_shape, object_shape)
 
 
 def draw_each(
     longest: tuple[int, int],
-    rows: tuple[int, int],
+    sizes: tuple[int, int],
     generators: Sequence[torch.Generator],
     object_features: int = OBJECT_FEATURES,
 ) -> Motion:
-    """Noise (B, 2, K, 99) and (B, L, object_features), a generator for each of B motions. rows: K and L.
+    """Noise (B, 2, K, 99) and (B, L, object_features) with one generator per motion.
 
-    The ``longest`` motion's noise is drawn and cut: a motion's noise does not depend on the others of its batch.
+    Noise of the ``longest`` motion is generated and cut, so that it does not depend on the other motions of the batch.
+
+    Args:
+        longest: K and L of the longest possible motion.
+        sizes: K and L of this batch.
     """
-    drawn = [
+    noise = [
         (
-            torch.randn(longest[0], 2, HAND_FEATURES, generator=generator)[: rows[0]].transpose(0, 1),
-            torch.randn(longest[1], object_features, generator=generator)[: rows[1]],
+            torch.randn(longest[0], 2, HAND_FEATURES, generator=generator)[: sizes[0]].transpose(0, 1),
+            torch.randn(longest[1], object_features, generator=generator)[: sizes[1]],
         )
         for generator in generators
     ]
-    return torch.stack([hands for hands, _ in drawn]), torch.stack([objects for _, objects in drawn])
+    return torch.stack([hands for hands, _ in noise]), torch.stack([objects for _, objects in noise])
 
 
 @torch.no_grad()
@@ -117,57 +120,67 @@ def sample(
     config: SamplerConfig,
     generator: torch.Generator | list[torch.Generator],
 ) -> Tensor:
-    """Samples from noise (B, ...), on its device; ``denoise(x, t)`` gives what is clean in x at timesteps (B,).
+    """Samples from noise (B, ...), on its device; ``denoise(x, t)`` predicts the clean x at timesteps t (B,).
 
-    generator: of the noise that DDPM adds, one for all rows or one for each.
+    generator: of the noise that DDPM adds, one for the batch or one per sample.
     """
-    x, walked, shares = noise, timesteps(config.steps), signal_shares()
-    before: Tensor | None = None
-    for number, step in enumerate(walked):
-        now, then = shares[step], shares[walked[number + 1]] if number + 1 < len(walked) else 1.0
+    x, steps, alpha_bars = noise, timesteps(config.steps), alpha_bar_values()
+    previous_clean: Tensor | None = None
+    for number, step in enumerate(steps):
+        alpha_bar = alpha_bars[step]
+        next_alpha_bar = alpha_bars[steps[number + 1]] if number + 1 < len(steps) else 1.0
         clean = denoise(x, torch.full((len(x),), step, device=x.device))
         if config.kind == "ddpm":
-            fresh = _drawn(x, generator) if then < 1 else torch.zeros_like(x)
-            x = _ddpm(x, clean, now, then, fresh)
-        elif config.kind == "ddim" or then == 1:
-            x = _ddim(x, clean, now, then)
+            added_noise = _noise_like(x, generator) if next_alpha_bar < 1 else torch.zeros_like(x)
+            x = _ddpm(x, clean, alpha_bar, next_alpha_bar, added_noise)
+        elif config.kind == "ddim" or next_alpha_bar == 1:
+            x = _ddim(x, clean, alpha_bar, next_alpha_bar)
         else:
-            last = shares[walked[number - 1]] if number else now
-            x = _dpm_solver(x, clean, before, last, now, then)
-        before = clean
+            last_alpha_bar = alpha_bars[steps[number - 1]] if number else alpha_bar
+            x = _dpm_solver(x, clean, previous_clean, last_alpha_bar, alpha_bar, next_alpha_bar)
+        previous_clean = clean
     return x
 
 
-def _ddpm(x: Tensor, clean: Tensor, now: float, then: float, fresh: Tensor) -> Tensor:
-    """Ho et al. 2020, eq. 6-7: the posterior of a step, between signal shares ``now`` and ``then``."""
-    ratio = now / then
-    mean = math.sqrt(then) * (1 - ratio) / (1 - now) * clean + math.sqrt(ratio) * (1 - then) / (1 - now) * x
-    return mean + math.sqrt((1 - then) / (1 - now) * (1 - ratio)) * fresh
+def _ddpm(x: Tensor, clean: Tensor, alpha_bar: float, next_alpha_bar: float, noise: Tensor) -> Tensor:
+    """One DDPM step: the posterior of Ho et al. 2020, Eq. 6-7."""
+    ratio = alpha_bar / next_alpha_bar
+    clean_weight = math.sqrt(next_alpha_bar) * (1 - ratio) / (1 - alpha_bar)
+    mean = clean_weight * clean + math.sqrt(ratio) * (1 - next_alpha_bar) / (1 - alpha_bar) * x
+    return mean + math.sqrt((1 - next_alpha_bar) / (1 - alpha_bar) * (1 - ratio)) * noise
 
 
-def _ddim(x: Tensor, clean: Tensor, now: float, then: float) -> Tensor:
-    """Song et al. 2021, eq. 12 with sigma 0."""
-    return math.sqrt(then) * clean + math.sqrt((1 - then) / (1 - now)) * (x - math.sqrt(now) * clean)
+def _ddim(x: Tensor, clean: Tensor, alpha_bar: float, next_alpha_bar: float) -> Tensor:
+    """One DDIM step: Song et al. 2021, Eq. 12 with sigma 0."""
+    noise = x - math.sqrt(alpha_bar) * clean
+    return math.sqrt(next_alpha_bar) * clean + math.sqrt((1 - next_alpha_bar) / (1 - alpha_bar)) * noise
 
 
-def _dpm_solver(x: Tensor, clean: Tensor, before: Tensor | None, last: float, now: float, then: float) -> Tensor:
-    """Lu et al. 2022 (DPM-Solver++), algorithm 2; its first step, without one ``before``, is of first order."""
-    width = _half_log_ratio(then) - _half_log_ratio(now)
+def _dpm_solver(
+    x: Tensor,
+    clean: Tensor,
+    previous_clean: Tensor | None,
+    last_alpha_bar: float,
+    alpha_bar: float,
+    next_alpha_bar: float,
+) -> Tensor:
+    """One DPM-Solver++ step: Lu et al. 2022, Algorithm 2; first order without ``previous_clean``."""
+    width = _half_log_ratio(next_alpha_bar) - _half_log_ratio(alpha_bar)
     data = clean
-    if before is not None:
-        share = (_half_log_ratio(now) - _half_log_ratio(last)) / width
-        data = clean + (clean - before) / (2 * share)
-    return math.sqrt((1 - then) / (1 - now)) * x - math.sqrt(then) * math.expm1(-width) * data
+    if previous_clean is not None:
+        ratio = (_half_log_ratio(alpha_bar) - _half_log_ratio(last_alpha_bar)) / width
+        data = clean + (clean - previous_clean) / (2 * ratio)
+    return math.sqrt((1 - next_alpha_bar) / (1 - alpha_bar)) * x - math.sqrt(next_alpha_bar) * math.expm1(-width) * data
 
 
-def _half_log_ratio(share: float) -> float:
-    """Half the logarithm of signal over noise."""
-    return 0.5 * math.log(share / (1 - share))
+def _half_log_ratio(alpha_bar: float) -> float:
+    """Half the log signal-to-noise ratio."""
+    return 0.5 * math.log(alpha_bar / (1 - alpha_bar))
 
 
-def _drawn(x: Tensor, generator: torch.Generator | list[torch.Generator]) -> Tensor:
+def _noise_like(x: Tensor, generator: torch.Generator | list[torch.Generator]) -> Tensor:
     if isinstance(generator, list):
-        return send(torch.stack([torch.randn(x.shape[1:], generator=own) for own in generator]), x.device)
+        return send(torch.stack([torch.randn(x.shape[1:], generator=each) for each in generator]), x.device)
     return send(torch.randn(x.shape, generator=generator), x.device)
 
 

@@ -1,6 +1,6 @@
-"""Several processes that train one network: each computes its parts of every batch, and gradients are averaged.
+"""Data-parallel training of one network: each process computes some micro-batches, and gradients are averaged.
 
-What a step computes depends on the number of parts alone, so any number of processes gives the same weights.
+A step depends only on the number of micro-batches, so any number of processes gives the same weights.
 """
 
 import multiprocessing
@@ -21,14 +21,14 @@ from hoidata.errors import BadInput, HoidataError
 
 @dataclass(frozen=True)
 class Team:
-    """rank: number of this process among ``size``; the one of rank 0 writes."""
+    """The processes that train one network together, seen from one process; rank 0 writes."""
 
     rank: int = 0
     size: int = 1
 
     @classmethod
     def joined(cls) -> "Team":
-        """The team this process was started in, or a team of one."""
+        """The team in which this process was started, or a team of one."""
         return cls(dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else cls()
 
     @property
@@ -36,19 +36,21 @@ class Team:
         return self.rank == 0
 
     def device(self, name: str) -> str:
-        """``name``, or of several GPUs the one that is this process's own."""
+        """``name``; for "cuda" in a team of several, the GPU of this process."""
         several = name == "cuda" and self.size > 1
         return f"cuda:{self.rank % torch.cuda.device_count()}" if several else name
 
-    def own_parts(self, of: int) -> range:
-        """Which of ``of`` parts of a batch are computed here. Raises BadInput where they cannot be shared evenly."""
-        if of % self.size:
+    def own_micro_batches(self, count: int) -> range:
+        """This process's micro-batches, of ``count`` in all. Raises BadInput if they do not divide evenly."""
+        if count % self.size:
             expected = f"a multiple of the {self.size} processes"
-            raise BadInput("params.yaml: training.parts", expected, str(of), "set parts, or train.processes")
-        return range(self.rank, of, self.size)
+            raise BadInput(
+                "params.yaml: training.micro_batches", expected, str(count), "set micro_batches, or train.processes"
+            )
+        return range(self.rank, count, self.size)
 
-    def add_up(self, tensors: Iterable[Tensor]) -> None:
-        """Every tensor in the place of its sum over the team."""
+    def sum_over_team(self, tensors: Iterable[Tensor]) -> None:
+        """Replace every tensor by its sum over the team."""
         tensors = list(tensors)
         if self.size == 1 or not tensors:
             return
@@ -58,28 +60,32 @@ class Team:
             tensor.copy_(total.view_as(tensor))
 
 
-def run_team(work: Callable[..., None], size: int, meeting: Path, *given: object) -> None:
-    """``work(*given)`` in ``size`` new processes that are one team; a module's function, as processes start afresh.
+def run_team(work: Callable[..., None], size: int, meeting: Path, *arguments: object) -> None:
+    """Run ``work(*arguments)`` in ``size`` new processes that form one team. An error in a process is raised here.
 
-    meeting: a file, not there yet, by which they find each other. The error of one of them is raised here.
+    Args:
+        work: a function of a module, because processes start afresh.
+        meeting: a file that does not exist yet, through which the processes find each other.
     """
     if size == 1:
-        work(*given)
+        work(*arguments)
         return
     errors = multiprocessing.get_context("spawn").SimpleQueue()
     try:
-        spawn(_member, (work, size, meeting.absolute().as_uri(), errors, given), size)
+        spawn(_member, (work, size, meeting.absolute().as_uri(), errors, arguments), size)
     except ProcessException:
         if errors.empty():
             raise
         raise errors.get() from None
 
 
-def _member(rank: int, work: Callable[..., None], size: int, meeting: str, errors: SimpleQueue, given: tuple) -> None:
+def _member(
+    rank: int, work: Callable[..., None], size: int, meeting: str, errors: SimpleQueue, arguments: tuple
+) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     dist.init_process_group("gloo", init_method=meeting, rank=rank, world_size=size)
     try:
-        work(*given)
+        work(*arguments)
     except HoidataError as error:
         errors.put(error)
         raise
@@ -88,7 +94,7 @@ def _member(rank: int, work: Callable[..., None], size: int, meeting: str, error
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent has ended: torch asks for SIGINT then, which may be ignored or swallowed."""
+    """End this process when its parent ends. Torch relies on SIGINT, which may be ignored."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()

@@ -1,4 +1,4 @@
-"""What models have been told about in training: verbs, objects and hands of their clips, kept in every checkpoint."""
+"""Verbs, objects and hand types of the training clips, stored in every checkpoint."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -10,9 +10,9 @@ from hoidata.batches.dataset import ClipSample
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """What training clips were about. counts: clips by (verb, object words, hand type)."""
+    """Numbers of training clips by content."""
 
-    counts: Mapping[tuple[str, str, str], int]
+    counts: Mapping[tuple[str, str, str], int]  # by (verb, object words, hand type)
 
     @classmethod
     def of(cls, samples: Iterable[ClipSample]) -> "Vocabulary":
@@ -20,15 +20,17 @@ class Vocabulary:
 
     @classmethod
     def read(cls, facts: Mapping[str, Any]) -> "Vocabulary":
-        """From what a checkpoint records."""
-        return cls({(verb, thing, hand): count for verb, thing, hand, count in facts.get("vocabulary", [])})
+        """From the facts of a checkpoint."""
+        return cls(
+            {(verb, object_words, hand): count for verb, object_words, hand, count in facts.get("vocabulary", [])}
+        )
 
     def __add__(self, other: "Vocabulary") -> "Vocabulary":
         return Vocabulary(Counter(self.counts) + Counter(other.counts))
 
     @property
     def rows(self) -> list[list[str | int]]:
-        """What a checkpoint records: verb, object, hand type, clips."""
+        """For the facts of a checkpoint: verb, object words, hand type, number of clips."""
         return [[*key, count] for key, count in sorted(self.counts.items())]
 
     @property
@@ -40,17 +42,18 @@ class Vocabulary:
         return self._clips_by(1)
 
     def _clips_by(self, column: int) -> Counter[str]:
-        found: Counter[str] = Counter()
+        counts: Counter[str] = Counter()
         for key, count in self.counts.items():
-            found[key[column]] += count
-        return found
+            counts[key[column]] += count
+        return counts
 
     def knows(self, verb: str | None, object_words: str | None) -> int:
-        """How well training clips fit a sentence. Its verb counts most: one of training beats any object.
+        """Score of how well the training clips cover a sentence; larger is better.
 
-        Then an object that was seen with this verb, seen at all, or of the same kind ("bottle" and "water bottle").
+        A known verb counts more than any object. Then come an object seen with this verb, a known object, and one with
+        the same head noun, such as "bottle" and "water bottle".
         """
-        both = any(key[:2] == (verb, object_words) for key in self.counts)
-        kind = (object_words or "").split()[-1:]
-        alike = bool(kind) and any(other.split()[-1:] == kind for other in self.objects)
-        return 8 * (verb in self.verbs) + 4 * both + 2 * (object_words in self.objects) + alike
+        seen_together = any(key[:2] == (verb, object_words) for key in self.counts)
+        head_noun = (object_words or "").split()[-1:]
+        same_kind = bool(head_noun) and any(other.split()[-1:] == head_noun for other in self.objects)
+        return 8 * (verb in self.verbs) + 4 * seen_together + 2 * (object_words in self.objects) + same_kind

@@ -21,7 +21,7 @@ from hoidata.settings import plain_config
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.workers import in_workers
 from models.common.checkpoints import save_checkpoint
-from models.common.repeatable import make_repeatable, own_draws
+from models.common.repeatable import make_repeatable, restored_rng
 from models.evaluator.encoders import stored_network, weights_digest
 from models.evaluator.inputs import Examples
 from models.evaluator.networks import EncoderConfig, MotionEncoder
@@ -155,7 +155,7 @@ def _chosen(trainings: Sequence[Trained]) -> Trained:
 
 def _trained(name: NetworkName, seed: int, parts: dict[str, Examples], settings: EvaluatorSettings) -> Trained:
     train = parts["train"]
-    with own_draws():
+    with restored_rng():
         torch.manual_seed(seed)
         task, network = _task(name, train), MotionEncoder(config_of(name, train))
         known = {split: examples for split, examples in parts.items() if task.can_weigh(examples)}
@@ -171,7 +171,7 @@ def _trained(name: NetworkName, seed: int, parts: dict[str, Examples], settings:
 
 
 def _network(name: NetworkName, trained: Trained, train: Examples) -> MotionEncoder:
-    with own_draws():
+    with restored_rng():
         network = MotionEncoder(config_of(name, train))
     network.load_state_dict(load(trained.weights))
     return network.eval()

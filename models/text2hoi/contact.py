@@ -1,18 +1,17 @@
-"""Which points of an object the hands will touch, from a sentence: PointNet with a conditional VAE, or with anchors.
+"""Which points of an object the hands will touch, from a sentence: PointNet with a conditional VAE or with anchors.
 
-``ContactModel`` is Text2HOI's: Sec. 3.1 and supplement, Tables S4-S6. Layers that see per-clip features compute them
-once per clip instead of once per point (the same function).
+``ContactModel`` is Text2HOI's: Sec. 3.1 and supplement, Tables S4-S6. Layers that read per-clip features run once per
+clip instead of once per point; the function is the same.
 
-``AnchoredContact`` samples a few touched points for each hand, then both hands' maps. Text2HOI's Gaussian latent is
-ignored by a network trained on few clips: two samples agree. A point that is touched is a latent with a meaning, on any
-object: which points may be touched next is a distribution over the surface (soft cross-entropy, no collapse), and given
-a few of them little is left open. The right hand's are drawn knowing the left's; maps come by hand, so hand flags
-decide which there are.
+``AnchoredContact`` first samples a few touched points of each hand, the anchors, then predicts both hands' maps given
+them. A network trained on few clips ignores Text2HOI's Gaussian latent: two samples agree. Anchors cannot be ignored.
+Each is sampled from a distribution over the surface, trained by cross-entropy, and a few anchors nearly determine the
+map. The left hand's anchors are sampled first and condition the right hand's.
 """
 
 from dataclasses import dataclass, field
 from itertools import product
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -24,36 +23,41 @@ from models.common.features import TEXT_FEATURES, scaled_text
 from models.common.point_net import PointLayer, PointNet, PointNetConfig, normalised_points
 
 HAND_FLAGS = 2
-TOUCH_WEIGHT = 0.1  # of the cross-entropy of touches beside that of the maps they give
+TOUCH_WEIGHT = 0.1  # of the anchors' cross-entropy relative to that of the maps
 N_SIDES = 2
-ANCHORS = 4  # touches that a map is drawn by, of each hand
+ANCHORS = 4  # per hand
 ANCHOR_FEATURES = 8
-WAVES = (1.0, 2.0, 4.0)
-REACHES = (0.1, 0.2, 0.4)
-FAR = 10.0
+WAVES = (1.0, 2.0, 4.0)  # frequencies of sine and cosine position features
+REACHES = (0.1, 0.2, 0.4)  # widths of Gaussians about the anchors, relative to the object's radius
+FAR = 10.0  # distance of a point from an anchor that is not given
 ANCHOR_STRIDE = 4  # every fourth of the sampled points may become an anchor
-Cloud = tuple[Tensor, Tensor, Tensor]
+
+
+class EncodedPoints(NamedTuple):
+    """What ``AnchoredContact`` computes before any anchor is known."""
+
+    points: Tensor  # (B, N, 3) normalised
+    local: Tensor  # (B, N, L) per-point features
+    clip: Tensor  # (B, width) features of object, sentence and hand flags
 
 
 @dataclass(frozen=True)
 class ContactConfig:
-    """Sizes; the defaults are the paper's.
-
-    drawn_by: what a sample is drawn by: the paper's Gaussian latent, which gives one map for both hands, or anchors,
-    touched points of each hand drawn one after the other (``AnchoredContact``), which gives a map for each.
-    """
+    """Sizes of the contact network; the defaults are the paper's."""
 
     point_net: PointNetConfig = field(default_factory=PointNetConfig)
     decoder_widths: tuple[int, int, int] = (512, 256, 128)
     latent: int = 64
-    drawn_by: Literal["latent", "anchor"] = "latent"
+    # What a sample is generated from: the paper's Gaussian latent, with one map for both hands, or anchor points, with
+    # one map per hand (``AnchoredContact``).
+    sampled_from: Literal["latent", "anchor_points"] = "latent"
 
 
 @dataclass(frozen=True)
 class ContactLossConfig:
-    """points: how many points of every object a step sees, drawn anew each time."""
+    """The loss's sizes."""
 
-    points: int = 1024
+    points: int = 1024  # sampled from every object in each training step
 
 
 class ContactModel(nn.Module):
@@ -72,7 +76,7 @@ class ContactModel(nn.Module):
             nn.Linear(heads[1], 2 * config.latent),
         )
         first, second, third = config.decoder_widths
-        # Table S6's first layer, which sees the same numbers of a clip at each point, in two pieces.
+        # Table S6's first layer, split in two: the inputs per clip are equal at every point.
         self.from_point = nn.Linear(local, first)
         self.from_clip = nn.Linear(overall + 1 + TEXT_FEATURES + config.latent, first, bias=False)
         self.rest = nn.Sequential(
@@ -102,22 +106,23 @@ class ContactModel(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Training pass: logits (B, N), mean and log-variance of z; noise (B, latent) for the reparameterisation."""
         mean, log_variance = self.encode(normalised_points(points_m)[0], contact_map)
+        # Reparameterisation (Kingma and Welling 2014): the gradient passes through mean and variance.
         latent = mean + (0.5 * log_variance).exp() * noise
         return self.decode(points_m, text, latent), mean, log_variance
 
     @torch.no_grad()
     def sample(self, batch: RequestBatch, text: Tensor, latents: Tensor) -> Tensor:
-        """Contact probabilities (B, count, 2, N), alike for hands that act; latents (count, B, latent) from N(0, I)."""
+        """Contact probabilities (B, count, 2, N), equal for active hands; latents (count, B, latent) from N(0, I)."""
         maps = torch.stack([self.decode(batch.points_m, text, z).sigmoid() for z in latents], 1)
         return maps[:, :, None] * batch.active_hands[:, None, :, None]
 
     def draw_latents(self, count: int, n_clips: int, generator: torch.Generator) -> Tensor:
-        """(count, clip, latent) draws from N(0, I)."""
+        """Latents (count, clip, latent) from N(0, I)."""
         return torch.randn(count, n_clips, self.config.latent, generator=generator)
 
 
 def contact_loss(logits: Tensor, contact_map: Tensor, mean: Tensor, log_variance: Tensor) -> dict[str, Tensor]:
-    """Summed cross-entropy, Dice (per clip) and KL divergence to N(0, I) per latent, by name, and their "total"."""
+    """Cross-entropy summed over points, Dice and KL divergence to N(0, I), per clip, and their sum "total"."""
     cross = functional.binary_cross_entropy_with_logits(logits, contact_map) * logits.shape[1]
     probability = logits.sigmoid()
     dice = 1 - (2 * (probability * contact_map).sum(1) + 1) / (probability.sum(1) + contact_map.sum(1) + 1)
@@ -127,7 +132,7 @@ def contact_loss(logits: Tensor, contact_map: Tensor, mean: Tensor, log_variance
 
 
 class AnchoredContact(nn.Module):
-    """Logits of the next touch and of the maps, given the touches (anchors) that are known."""
+    """Predicts the next anchor and both contact maps from the anchors given so far."""
 
     def __init__(self, config: ContactConfig) -> None:
         super().__init__()
@@ -148,95 +153,114 @@ class AnchoredContact(nn.Module):
             nn.Linear(third, 2 * N_SIDES),
         )
 
-    def see(self, points_m: Tensor, text: Tensor, active_hands: Tensor) -> Cloud:
-        """Normalised points (B, N, 3), their features, and those of each clip: all that anchors do not change."""
+    def encode_points(self, points_m: Tensor, text: Tensor, active_hands: Tensor) -> EncodedPoints:
+        """Encode an object with points (B, N, 3), a sentence (B, 512) and hand flags (B, 2); anchors come later."""
         points, scale = normalised_points(points_m)
         overall, local = self.object_net(points)
         clip = torch.cat((overall, scale, scaled_text(text), active_hands.float()), -1)
-        return points, local, self.from_clip(clip)
+        return EncodedPoints(points, local, self.from_clip(clip))
 
-    def logits(self, cloud: Cloud, at: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-        """Of touches and of maps, (B, 2, N) each; at (B, 2, A, 3): anchors, known (B, 2, A): which of them count."""
+    def logits(self, cloud: EncodedPoints, anchors: Tensor, anchor_mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits of the next anchor and of the contact maps, (B, 2, N) each, by hand.
+
+        Args:
+            anchors: (B, 2, A, 3) normalised points.
+            anchor_mask: (B, 2, A) bool, the anchors given so far.
+        """
         points, local, clip = cloud
-        distance = torch.cdist(points[:, None], at).masked_fill(~known[:, :, None], FAR)
-        nearest, which = distance.min(-1)
-        offset = points[:, None] - at.gather(2, which[..., None].expand(-1, -1, -1, 3))
+        distance = torch.cdist(points[:, None], anchors).masked_fill(~anchor_mask[:, :, None], FAR)
+        nearest_distance, nearest_anchor = distance.min(-1)
+        offset = points[:, None] - anchors.gather(2, nearest_anchor[..., None].expand(-1, -1, -1, 3))
+        # Gaussians of the distance to each anchor, at three scales.
         bells = [torch.exp(-0.5 * (distance / reach).square()).sum(-1) for reach in REACHES]
-        share = known.to(points.dtype).mean(-1)[..., None].expand_as(nearest)
-        near = torch.cat((offset, torch.stack((nearest, share, *bells), -1)), -1) * known.any(-1)[..., None, None]
+        anchor_fraction = anchor_mask.to(points.dtype).mean(-1)[..., None].expand_as(nearest_distance)
+        anchor_features = torch.cat((offset, torch.stack((nearest_distance, anchor_fraction, *bells), -1)), -1)
+        anchor_features = anchor_features * anchor_mask.any(-1)[..., None, None]
+        # Sine and cosine features let a linear layer resolve fine positions.
         waves = [wave(points * (torch.pi * rate)) for rate in WAVES for wave in (torch.sin, torch.cos)]
-        seen = (local, points, *waves, near.transpose(1, 2).flatten(2))
-        mixed = self.from_point(torch.cat(seen, -1)) + clip[:, None]
+        features = (local, points, *waves, anchor_features.transpose(1, 2).flatten(2))
+        mixed = self.from_point(torch.cat(features, -1)) + clip[:, None]
         touch, contact = self.rest(mixed).transpose(1, 2).split(N_SIDES, 1)
         return touch, contact
 
     def losses(
         self, points_m: Tensor, text: Tensor, batch: RequestBatch, contact: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        """Cross-entropy of the next touch of one hand; and logits of the maps given all anchors, drawn evenly.
+        """Cross-entropy of one hand's next anchor, and logits (B, 2, N) of the maps given all anchors.
 
-        The left hand's next touch is told some of its own, the right's also all of the left's. contact (B, 2, N) float:
-        the true maps. A hand without any touched point has no anchor.
+        Anchors are sampled uniformly from touched points. The left hand's next anchor is predicted from a random number
+        of its first ones, the right hand's also from all of the left hand's. A hand without contact has no anchors.
+
+        Args:
+            contact: (B, 2, N) float, recorded maps.
         """
-        cloud, count, device = self.see(points_m, text, batch.active_hands), ANCHORS, contact.device
-        there = contact.any(-1) & batch.active_hands
-        rows = picked(contact, send(torch.rand(len(contact), N_SIDES, count, generator=generator), device))
-        anchors = cloud[0][:, None].expand(-1, N_SIDES, -1, -1).gather(2, rows[..., None].expand(-1, -1, -1, 3))
-        draws = send(torch.rand(len(contact), 2, generator=generator), device)
-        right = there[:, 1] & (~there[:, 0] | (draws[:, 0] < 0.5))
-        next_one = (draws[:, 1] * count).long()
-        some = torch.arange(count, device=device) < next_one[:, None]
-        known = torch.stack((some | right[:, None], some & right[:, None]), 1) & there[..., None]
-        side = right.long()[:, None, None]
-        told = self.logits(cloud, anchors, known)[0].log_softmax(-1).take_along_dim(side, 1)[:, 0]
-        wanted = contact.take_along_dim(side, 1)[:, 0]
-        wanted = wanted / wanted.sum(-1, keepdim=True).clamp_min(1)
-        touch = -(wanted * told).sum() / there.any(-1).sum().clamp_min(1)
-        return touch, self.logits(cloud, anchors, there[..., None].expand_as(known))[1]
+        cloud, count, device = self.encode_points(points_m, text, batch.active_hands), ANCHORS, contact.device
+        has_contact = contact.any(-1) & batch.active_hands
+        uniform = send(torch.rand(len(contact), N_SIDES, count, generator=generator), device)
+        index = sample_indices(contact, uniform)[..., None].expand(-1, -1, -1, 3)
+        anchors = cloud.points[:, None].expand(-1, N_SIDES, -1, -1).gather(2, index)
+        random = send(torch.rand(len(contact), 2, generator=generator), device)
+        is_right = has_contact[:, 1] & (~has_contact[:, 0] | (random[:, 0] < 0.5))
+        given_count = (random[:, 1] * count).long()
+        is_given = torch.arange(count, device=device) < given_count[:, None]
+        # Of the left hand all anchors are given if the right hand's next one is predicted.
+        anchor_mask = torch.stack((is_given | is_right[:, None], is_given & is_right[:, None]), 1)
+        anchor_mask = anchor_mask & has_contact[..., None]
+        side = is_right.long()[:, None, None]
+        log_probability = self.logits(cloud, anchors, anchor_mask)[0].log_softmax(-1).take_along_dim(side, 1)[:, 0]
+        target = contact.take_along_dim(side, 1)[:, 0]
+        target = target / target.sum(-1, keepdim=True).clamp_min(1)
+        # Soft cross-entropy: every touched point is an equally good next anchor.
+        touch = -(target * log_probability).sum() / has_contact.any(-1).sum().clamp_min(1)
+        return touch, self.logits(cloud, anchors, has_contact[..., None].expand_as(anchor_mask))[1]
 
     @torch.no_grad()
     def sample(self, batch: RequestBatch, text: Tensor, latents: Tensor) -> Tensor:
-        """Contact probabilities (B, count, 2, N) by hand for sentences (B, text) and latents (count, B, 2, A), even
-        draws from 0 to 1. A hand that acts in no clip of the batch costs nothing.
+        """Contact probabilities (B, count, 2, N) by hand; a hand inactive in the whole batch costs nothing.
+
+        Args:
+            text: (B, 512) sentence features.
+            latents: (count, B, 2, A) uniform random numbers from 0 to 1.
         """
         points_m, active_hands = batch.points_m, batch.active_hands
-        cloud, maps = self.see(points_m, text, active_hands), []
+        cloud, maps = self.encode_points(points_m, text, active_hands), []
         sides = [side for side in range(N_SIDES) if batch.sides[side]]
-        some = cloud[0][:, ::ANCHOR_STRIDE], cloud[1][:, ::ANCHOR_STRIDE], cloud[2]
+        candidates = EncodedPoints(cloud.points[:, ::ANCHOR_STRIDE], cloud.local[:, ::ANCHOR_STRIDE], cloud.clip)
         clips = torch.arange(len(points_m), device=points_m.device)
-        nothing = latents.new_zeros(latents.shape[1:], dtype=torch.bool)
-        nowhere = points_m.new_zeros(*nothing.shape, 3)
-        first = self.logits(some, nowhere, nothing)[0]  # the same for every draw
-        for draw in latents:
-            anchors, known = nowhere.clone(), nothing.clone()
-            for turn, (side, number) in enumerate(product(sides, range(ANCHORS))):
-                touches = self.logits(some, anchors, known)[0] if turn else first
-                touch = touches[:, side].softmax(-1)
-                anchors[:, side, number] = some[0][clips, picked(touch, draw[:, side, number, None])[:, 0]]
-                known[:, side, number] = active_hands[:, side]
-            maps.append(self.logits(cloud, anchors, known)[1].sigmoid() * active_hands[..., None])
+        no_mask = latents.new_zeros(latents.shape[1:], dtype=torch.bool)
+        no_anchors = points_m.new_zeros(*no_mask.shape, 3)
+        first_touch = self.logits(candidates, no_anchors, no_mask)[0]  # the same for every sample
+        for uniform in latents:
+            anchors, anchor_mask = no_anchors.clone(), no_mask.clone()
+            for step, (side, anchor) in enumerate(product(sides, range(ANCHORS))):
+                touch_logits = self.logits(candidates, anchors, anchor_mask)[0] if step else first_touch
+                probability = touch_logits[:, side].softmax(-1)
+                index = sample_indices(probability, uniform[:, side, anchor, None])[:, 0]
+                anchors[:, side, anchor] = candidates.points[clips, index]
+                anchor_mask[:, side, anchor] = active_hands[:, side]
+            maps.append(self.logits(cloud, anchors, anchor_mask)[1].sigmoid() * active_hands[..., None])
         return torch.stack(maps, 1)
 
     def draw_latents(self, count: int, n_clips: int, generator: torch.Generator) -> Tensor:
-        """(count, clip, 2, A) draws that choose the touches."""
+        """Uniform random numbers (count, clip, 2, A) from which anchors are sampled."""
         return torch.rand(count, n_clips, N_SIDES, ANCHORS, generator=generator)
 
 
-def picked(weights: Tensor, draws: Tensor) -> Tensor:
-    """(..., K) places drawn in proportion to weights (..., N) by even draws (..., K) from 0 to 1; none is beyond N."""
-    places = torch.arange(weights.shape[-1], device=weights.device)
-    cumulative = weights @ (places[:, None] <= places).to(weights.dtype)  # cumsum on a GPU has no order it keeps to
-    found = torch.searchsorted(cumulative, draws * cumulative[..., -1:], right=True)
-    return found.clamp_max(weights.shape[-1] - 1)
+def sample_indices(weights: Tensor, uniform: Tensor) -> Tensor:
+    """Indices (..., K) sampled in proportion to weights (..., N), from uniform random numbers (..., K)."""
+    index = torch.arange(weights.shape[-1], device=weights.device)
+    cumulative = weights @ (index[:, None] <= index).to(weights.dtype)  # torch.cumsum is not deterministic on a GPU
+    sampled = torch.searchsorted(cumulative, uniform * cumulative[..., -1:], right=True)
+    return sampled.clamp_max(weights.shape[-1] - 1)
 
 
 def by_hand_loss(touch: Tensor, logits: Tensor, contact: Tensor, active_hands: Tensor) -> dict[str, Tensor]:
-    """Cross-entropy and Dice of the maps (B, 2, N) of hands that act, and that of touches, as parts and "total"."""
-    there = active_hands.to(logits.dtype)
-    total = there.sum().clamp_min(1)
+    """Cross-entropy and Dice of active hands' maps (B, 2, N), the anchors' loss ``touch``, and their "total"."""
+    mask = active_hands.to(logits.dtype)
+    count = mask.sum().clamp_min(1)
     cross = functional.binary_cross_entropy_with_logits(logits, contact, reduction="none").mean(-1)
     probability = logits.sigmoid()
     dice = 1 - (2 * (probability * contact).sum(-1) + 1) / (probability.sum(-1) + contact.sum(-1) + 1)
-    parts = {"cross_entropy": (cross * there).sum() / total, "dice": (dice * there).sum() / total, "touch": touch}
-    whole = parts["cross_entropy"] + parts["dice"] + TOUCH_WEIGHT * touch
-    return {"total": whole, **parts}
+    parts = {"cross_entropy": (cross * mask).sum() / count, "dice": (dice * mask).sum() / count, "touch": touch}
+    total = parts["cross_entropy"] + parts["dice"] + TOUCH_WEIGHT * touch
+    return {"total": total, **parts}

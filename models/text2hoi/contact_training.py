@@ -1,5 +1,4 @@
-"""Training of the contact network: what one step and one validation are, and what is found on validation clips:
-the probability from which a point counts as touched."""
+"""Training of the contact network, and its results on validation clips: probability thresholds of contact."""
 
 from collections.abc import Callable
 from functools import cached_property
@@ -26,18 +25,18 @@ from models.text2hoi.contact import (
 
 ContactNetwork = ContactModel | AnchoredContact
 
-UNCHOSEN_THRESHOLD = 0.5  # without validation clips: touched where that is likelier than not
+DEFAULT_THRESHOLD = 0.5  # without validation clips
 THRESHOLDS = tuple(round(0.05 * step, 2) for step in range(1, 20))
 
 
 def mean_f1(probabilities: np.ndarray, true: np.ndarray, threshold: float) -> float:
-    """Mean over clips of the F1 of maps (clip, point) of probabilities at a threshold."""
+    """Mean over clips of the F1 of maps (clip, point), with probabilities cut at ``threshold``."""
     pairs = zip(probabilities, true, strict=True)
     return float(np.mean([f1_score(probability >= threshold, truth) for probability, truth in pairs]))
 
 
 def best_threshold(probabilities: np.ndarray, true: np.ndarray) -> float:
-    """The threshold among 0.05, 0.10, ... 0.95 with the best mean F1; the lowest of equals."""
+    """The threshold among 0.05, 0.10, ... 0.95 with the best mean F1; the lowest if several are best."""
     scores = [mean_f1(probabilities, true, threshold) for threshold in THRESHOLDS]
     return THRESHOLDS[int(np.argmax(scores))]
 
@@ -50,7 +49,7 @@ def true_maps(samples: list[ClipSample]) -> np.ndarray:
 @torch.no_grad()
 def contact_probabilities(network: ContactNetwork, samples: list[ClipSample], count: int, seed: int) -> np.ndarray:
     """(clip, point) mean of ``count`` sampled maps, for the first sentence of every clip."""
-    batch, latents = _asked(network, samples, count, seed)
+    batch, latents = _batch_and_latents(network, samples, count, seed)
     return network.sample(batch, batch.text[:, 0], latents).amax(2).mean(1).cpu().numpy()
 
 
@@ -60,26 +59,31 @@ def choose_contact_threshold(network: ContactNetwork, held_out: list[ClipSample]
 
 
 @torch.no_grad()
-def choose_draw_threshold(network: ContactNetwork, held_out: list[ClipSample], count: int = 8) -> float:
-    """The threshold at which single samples touch as large a share of an object as held-out clips do."""
-    batch, latents = _asked(network, held_out, count, seed=0)
-    found = network.sample(batch, batch.text[:, 0], latents).amax(2)
-    share = float(batch.contact.any(1).float().mean())
-    return min(THRESHOLDS, key=lambda threshold: abs(float((found >= threshold).float().mean()) - share))
+def choose_sample_threshold(network: ContactNetwork, held_out: list[ClipSample], count: int = 8) -> float:
+    """The threshold at which single samples touch the same fraction of points as held-out clips do."""
+    batch, latents = _batch_and_latents(network, held_out, count, seed=0)
+    probabilities = network.sample(batch, batch.text[:, 0], latents).amax(2)
+    touched_fraction = float(batch.contact.any(1).float().mean())
+    return min(
+        THRESHOLDS, key=lambda threshold: abs(float((probabilities >= threshold).float().mean()) - touched_fraction)
+    )
 
 
-def _asked(network: ContactNetwork, samples: list[ClipSample], count: int, seed: int) -> tuple[ClipBatch, Tensor]:
-    """The clips, and so many draws for each, where the network is."""
+def _batch_and_latents(
+    network: ContactNetwork, samples: list[ClipSample], count: int, seed: int
+) -> tuple[ClipBatch, Tensor]:
+    """The clips as a batch and ``count`` latents for each, on the network's device."""
     device = next(network.parameters()).device
     latents = network.draw_latents(count, len(samples), torch.Generator().manual_seed(seed))
     return collate(samples).to(device), send(latents, device)
 
 
-DrawContact = Callable[[RequestBatch, Tensor, torch.Generator], Tensor]
+# From a batch, sentence features (B, 512) and random numbers to contact maps (B, 2, N) by hand.
+SampleContact = Callable[[RequestBatch, Tensor, torch.Generator], Tensor]
 
 
 class ContactObjective:
-    """Text2HOI Sec. 3.1: cross-entropy, Dice and KL divergence; or anchors in place of the latent."""
+    """Losses of the contact network: Text2HOI, Sec. 3.1, or those of ``AnchoredContact``."""
 
     frames = entries = 0
 
@@ -91,14 +95,14 @@ class ContactObjective:
         return collate(self.corpus.held_out).to(self.device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
-        some = send(torch.randperm(batch.points_m.shape[1], generator=generator)[: self.loss.points], self.device)
-        points, text, network = batch.points_m[:, some], any_form(batch, generator), self.network
+        chosen = send(torch.randperm(batch.points_m.shape[1], generator=generator)[: self.loss.points], self.device)
+        points, text, network = batch.points_m[:, chosen], any_form(batch, generator), self.network
         if isinstance(network, AnchoredContact):
-            contact = batch.contact[..., some].float()
+            contact = batch.contact[..., chosen].float()
             touch, logits = network.losses(points, text, batch, contact, generator)
             return by_hand_loss(touch, logits, contact, batch.active_hands)
         assert isinstance(network, ContactModel)
-        contact_map = batch.contact_map[:, some]
+        contact_map = batch.contact_map[:, chosen]
         noise = send(torch.randn(len(batch), network.config.latent, generator=generator), self.device)
         logits, mean, log_variance = network(points, text, contact_map, noise)
         return contact_loss(logits, contact_map, mean, log_variance)
@@ -106,57 +110,61 @@ class ContactObjective:
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, ContactModel | AnchoredContact)
-        held = self.held_out
-        latents = send(network.draw_latents(4, len(held), torch.Generator().manual_seed(0)), self.device)
-        probability = network.sample(held, held.text[:, 0], latents).amax(2).mean(1)
-        return nn.functional.binary_cross_entropy(probability.clamp(1e-4, 1 - 1e-4), held.contact_map)
+        batch = self.held_out
+        latents = send(network.draw_latents(4, len(batch), torch.Generator().manual_seed(0)), self.device)
+        probability = network.sample(batch, batch.text[:, 0], latents).amax(2).mean(1)
+        return nn.functional.binary_cross_entropy(probability.clamp(1e-4, 1 - 1e-4), batch.contact_map)
 
 
 def contact_network(config: ContactConfig) -> ContactModel | AnchoredContact:
     """The network the config describes."""
-    return AnchoredContact(config) if config.drawn_by == "anchor" else ContactModel(config)
+    return AnchoredContact(config) if config.sampled_from == "anchor_points" else ContactModel(config)
 
 
 def contact_threshold(checkpoint: Checkpoint) -> float:
-    """The mean probability of samples from which a point counts as touched.
+    """From this mean probability over samples a point counts as touched.
 
-    Chosen on validation clips; ``UNCHOSEN_THRESHOLD`` without any.
+    Chosen on validation clips; ``DEFAULT_THRESHOLD`` without any.
     """
     return float(checkpoint.info["results"]["contact_threshold"])
 
 
-def draw_threshold(checkpoint: Checkpoint) -> float:
-    """The same for the probability in one sample: best for means is too low for anchors, whose samples differ."""
+def sample_threshold(checkpoint: Checkpoint) -> float:
+    """From this probability in one sample a point counts as touched; higher than that of means if samples differ."""
     results = checkpoint.info["results"]
     return float(results.get("draw_threshold", results["contact_threshold"]))
 
 
 def touched_maps(checkpoint: Checkpoint, batch: RequestBatch, text: Tensor, latents: Tensor) -> Tensor:
-    """(B, K, 2, N) maps by hand, 0 or 1, for sentences (B, 512) and latents (K, B, ...) as the network draws them.
+    """Sampled contact maps (B, K, 2, N), 0 or 1, by hand; the most probable points if none reaches the threshold.
 
-    Where no point reaches the threshold the likeliest ones count.
+    Args:
+        text: (B, 512) sentence features.
+        latents: (K, B, ...) from the network's ``draw_latents``.
     """
     network = checkpoint.network
     assert isinstance(network, ContactNetwork)
     probability = network.sample(batch, text, send(latents, text.device))
-    limit = probability.amax(-1, keepdim=True).clamp_max(draw_threshold(checkpoint))
+    # If no point reaches the threshold, the limit is the highest probability.
+    limit = probability.amax(-1, keepdim=True).clamp_max(sample_threshold(checkpoint))
     return ((probability >= limit) & batch.active_hands[:, None, :, None]).float()
 
 
 def most_typical(maps: Tensor) -> Tensor:
-    """(B, 2, N) of each row's maps (B, K, 2, N), 0 or 1, the one whose F1 with the others, either hand's, is best.
+    """The medoid of each motion's maps (B, K, 2, N), 0 or 1: the one with the best mean F1 with the others, (B, 2, N).
 
-    The first of equals. Minimum Bayes risk: what is most like other draws is most like what may be expected.
+    F1 counts points touched by either hand. The first of equals. This is minimum Bayes risk decoding.
     """
     either = maps.amax(2)
-    shared, size = either @ either.transpose(1, 2), either.sum(-1)
-    agreement = 2 * shared / (size[:, :, None] + size[:, None]).clamp_min(1)
+    # F1 of all pairs of maps: 2 |A and B| / (|A| + |B|).
+    shared, sizes = either @ either.transpose(1, 2), either.sum(-1)
+    agreement = 2 * shared / (sizes[:, :, None] + sizes[:, None]).clamp_min(1)
     best = agreement.sum(-1).argmax(-1)
     return maps[torch.arange(len(maps), device=maps.device), best]
 
 
-def contact_drawer(checkpoint: Checkpoint) -> DrawContact:
-    """Draws maps for the motions of a batch from a trained contact network: the first of each, as the paper does."""
+def contact_sampler(checkpoint: Checkpoint) -> SampleContact:
+    """Samples one map per motion from a trained contact network, as in the paper."""
     network = checkpoint.network
     assert isinstance(network, ContactNetwork)
     return lambda batch, text, generator: touched_maps(
@@ -173,11 +181,13 @@ def _results(network: nn.Module, corpus: Corpus) -> dict[str, float]:
     assert isinstance(network, ContactModel | AnchoredContact)
     held_out = corpus.held_out
     if not held_out:
-        return {"contact_threshold": UNCHOSEN_THRESHOLD}
-    found = {"contact_threshold": choose_contact_threshold(network, held_out)}
+        return {"contact_threshold": DEFAULT_THRESHOLD}
+    results = {"contact_threshold": choose_contact_threshold(network, held_out)}
     if isinstance(network, AnchoredContact):
-        found["draw_threshold"] = choose_draw_threshold(network, held_out)
-    return found
+        results["draw_threshold"] = choose_sample_threshold(network, held_out)
+    return results
 
 
-CONTACT = Network("contact", ContactConfig, contact_network, _objective, ContactLossConfig, results=_results)
+CONTACT = Network(
+    "contact", ContactConfig, build=contact_network, objective=_objective, loss=ContactLossConfig, results=_results
+)

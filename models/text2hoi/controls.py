@@ -1,9 +1,10 @@
-"""Text2HOI with one thing taken from it, as families: what is then as good does not come from that. And rivals that
-have no networks: training clips of the prompt or the verb, held and looked up again as ours are.
+"""Negative controls and retrieval baselines for Text2HOI.
 
-Where hands of such a rival cannot carry, or the motion is not as usual of the verb, the next clip of the ranking is
-taken, as often as `ours` draws again and by the same rules, so that what choosing does is no merit of a network.
-(Presets whose hands no hold corrects draw once; these rows choose beside them, too.) A ranking may have fewer clips.
+A negative control is Text2HOI with one input replaced: a metric that does not change does not depend on that input.
+
+A retrieval baseline has no network: it retrieves a training clip of the same prompt or verb, and post-processes it like
+Text2HOI's samples. It applies contact refinement, then rejection sampling: if the hands cannot carry the object or the
+motion is unusual for its verb, the next clip of the ranking is a candidate. So selection gives networks no advantage.
 """
 
 from collections.abc import Sequence
@@ -24,20 +25,19 @@ from hoidata.settings import build_config
 from models.baselines.lookups import PROMPT_LOOKUP, VERB_LOOKUP
 from models.common.family import Family, LeftOut, Sampler, Sources
 from models.text2hoi.family import NAMES, OtherPrompt, load_text2hoi, other_prompts
-from models.text2hoi.sampler import Drawn, SamplingConfig, Text2Hoi, best_drawn, checked
+from models.text2hoi.sampler import Candidate, SamplingConfig, Text2Hoi, best_candidates, verb_check_results
 from models.text2hoi.verb_check import VerbCheck, usual_motion
 
 
 @dataclass(frozen=True)
 class OtherContact:
-    """Text2HOI told its own sentence and the contact map another clip of the object was recorded with.
+    """Text2HOI conditioned on the recorded contact map of another clip with the same object.
 
-    It still counts as asked for the map its own sentence gives: adherence to that is what the row must lose.
-    others: those maps by clip; a clip without another of its object has none.
+    It reports the contact map of its sentence as the requested one, so it must lose in adherence.
     """
 
     model: Text2Hoi
-    others: dict[str, Tensor]
+    others: dict[str, Tensor]  # contact maps by clip id; a clip without another one of its object is absent
 
     def sample(self, requests: Sequence[Request]) -> Sequence[Clip | LeftOut]:
         return self.sample_asked(requests)[0]
@@ -56,19 +56,19 @@ class OtherContact:
 
 @dataclass(frozen=True)
 class OwnContact:
-    """Text2HOI told another clip's sentence and the contact map that its own sentence gives."""
+    """Text2HOI conditioned on another clip's sentence, with the contact map of the original sentence."""
 
-    told_otherwise: OtherPrompt
+    other_prompt: OtherPrompt
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         return self.sample_asked(requests)[0]
 
     def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip | LeftOut], list[np.ndarray | None]]:
-        return self.told_otherwise.sample_asked(requests, self.told_otherwise.model.contact_maps(requests))
+        return self.other_prompt.sample_asked(requests, self.other_prompt.model.contact_maps(requests))
 
 
 def other_contact_maps(sources: Sources) -> dict[str, Tensor]:
-    """For every test clip the recorded map, of the other clips of its object, that shares least with its own."""
+    """For every test clip, the least similar recorded contact map of another test clip with the same object."""
     test, found = list(HoiDataset(sources.annotated, "test", crop="start")), {}
     for sample in test:
         others = [other for other in test if other.object_key == sample.object_key]
@@ -79,7 +79,7 @@ def other_contact_maps(sources: Sources) -> dict[str, Tensor]:
 
 
 def _shared(one: ClipSample, other: ClipSample) -> float:
-    """Points that both touch, as a share of those that either does."""
+    """Intersection over union of two clips' touched points."""
     either = (one.contact_map | other.contact_map).sum()
     return float((one.contact_map & other.contact_map).sum() / either) if either else 1.0
 
@@ -108,12 +108,12 @@ OTHER_PROMPT_OWN_CONTACT = _family(
 
 @dataclass(frozen=True)
 class HeldLookup:
-    """lookup: whose motions are held. config: ours has. check: of the training clips."""
+    """A retrieval baseline with contact refinement and rejection sampling."""
 
-    lookup: Sampler
+    lookup: Sampler  # retrieves training clips
     pair: HandPair
-    config: SamplingConfig
-    check: VerbCheck
+    config: SamplingConfig  # as of Text2HOI
+    check: VerbCheck  # of the training clips
 
     @classmethod
     def load(cls, lookup: Family, sources: Sources) -> "HeldLookup":
@@ -126,22 +126,22 @@ class HeldLookup:
         found = list(self.lookup.sample(requests))
         there = [row for row, one in enumerate(found) if isinstance(one, Clip)]
 
-        def draw(numbers: Sequence[int], which: int) -> list[Drawn]:
+        def draw(numbers: Sequence[int], which: int) -> list[Candidate]:
             own = [requests[there[number]] for number in numbers]
             again = [replace(one, number=one.number + which - 1) for one in own]
             clips = [found[there[number]] for number in numbers] if which == 1 else self.lookup.sample(again)
             return [self._held(one, clip) for one, clip in zip(own, clips, strict=True)]
 
-        for row, drawn in zip(there, best_drawn(len(there), self.config.draws, draw), strict=True):
+        for row, drawn in zip(there, best_candidates(len(there), self.config.max_attempts, draw), strict=True):
             found[row] = drawn.clip
         return found
 
-    def _held(self, request: Request, found: Clip | LeftOut) -> Drawn:
+    def _held(self, request: Request, found: Clip | LeftOut) -> Candidate:
         assert isinstance(found, Clip)
-        clip = hold_clip(self.pair, found, self.config.hold)
+        clip = hold_clip(self.pair, found, self.config.contact_refinement)
         asked = request.sentence.verb if request.sentence else None
-        known = checked(self.check, clip, request.points, asked)
-        return Drawn(clip, carried_share(self.pair, clip, self.config.hold), **known)
+        known = verb_check_results(self.check, clip, request.points, asked)
+        return Candidate(clip, carried_share(self.pair, clip, self.config.contact_refinement), **known)
 
 
 def _held(lookup: Family) -> Family:

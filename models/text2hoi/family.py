@@ -1,7 +1,7 @@
-"""Text2HOI as a family, the same before its refiner, and the same asked with another clip's sentence.
+"""Text2HOI as a family, also without its refiner, and conditioned on another clip's sentence.
 
-``diagnose`` gives figures from inside the networks on the test clips, beside their baselines: contact maps and lengths.
-How motions compare with recorded ones is no matter of a network: see ``hoidata.metrics``.
+``diagnose`` measures contact maps and lengths of the networks on the test clips, with baselines. ``hoidata.metrics``
+compares motions.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from models.common.point_net import normalised_points
 from models.common.predicting import first_sentence
 from models.text2hoi.contact_training import (
     CONTACT,
-    UNCHOSEN_THRESHOLD,
+    DEFAULT_THRESHOLD,
     ContactNetwork,
     best_threshold,
     contact_probabilities,
@@ -37,23 +37,23 @@ CONTACT_SAMPLES = 32
 
 
 def diagnose(sources: Sources) -> Figures:
-    """Contact F1 and length error on the test clips, by network."""
+    """Contact F1 and length error on the test clips, by network, rounded to six digits."""
     train, validation, test = (
         list(HoiDataset(sources.annotated, split, crop="start")) for split in ("train", "validation", "test")
     )
-    figures = {
-        "contact": contact_figures(sources, train, validation, test),
-        "length": length_figures(sources, train, test),
+    metrics = {
+        "contact": contact_metrics(sources, train, validation, test),
+        "length": length_metrics(sources, train, test),
     }
-    return {name: {key: round(float(value), 6) for key, value in rows.items()} for name, rows in figures.items()}
+    return {name: {key: round(float(value), 6) for key, value in values.items()} for name, values in metrics.items()}
 
 
-def contact_figures(
+def contact_metrics(
     sources: Sources, train: list[ClipSample], held_out: list[ClipSample], test: list[ClipSample]
 ) -> dict[str, float]:
-    """F1 of the mean of samples at the checkpoint's threshold, beside mean maps at thresholds chosen alike.
+    """F1 of the mean of sampled contact maps, and of mean training maps as baselines.
 
-    held_out: validation clips, on which thresholds of mean maps are chosen; ``UNCHOSEN_THRESHOLD`` without any.
+    held_out: validation clips, on which the thresholds of baselines are chosen; ``DEFAULT_THRESHOLD`` without any.
     """
     checkpoint = load_checkpoint(sources.checkpoints / CONTACT.name, CONTACT, sources.device)
     assert isinstance(checkpoint.network, ContactNetwork)
@@ -61,7 +61,7 @@ def contact_figures(
     f1 = mean_f1(contact_probabilities(checkpoint.network, test, CONTACT_SAMPLES, 0), true_maps(test), threshold)
     baselines = {}
     for kind in ("index", "position", "object"):
-        chosen = UNCHOSEN_THRESHOLD
+        chosen = DEFAULT_THRESHOLD
         if held_out:
             chosen = best_threshold(mean_maps(train, held_out, kind), true_maps(held_out))
         baselines[kind] = mean_f1(mean_maps(train, test, kind), true_maps(test), chosen)
@@ -78,8 +78,8 @@ def contact_figures(
     }
 
 
-def length_figures(sources: Sources, train: list[ClipSample], test: list[ClipSample]) -> dict[str, float]:
-    """Mean absolute error of the expected length, in frames, beside the mean length of the training clips."""
+def length_metrics(sources: Sources, train: list[ClipSample], test: list[ClipSample]) -> dict[str, float]:
+    """Mean absolute error of the expected length, in frames; the baseline is the mean length of training clips."""
     network = load_checkpoint(sources.checkpoints / LENGTH.name, LENGTH).network
     assert isinstance(network, LengthModel)
     batch = collate(test)
@@ -95,10 +95,10 @@ def length_figures(sources: Sources, train: list[ClipSample], test: list[ClipSam
 
 
 def mean_maps(train: list[ClipSample], clips: list[ClipSample], kind: str) -> np.ndarray:
-    """(clip, point) baseline maps from training clips.
+    """Baseline contact maps (clip, point) from training clips.
 
-    kind "index": mean by point index. "position": mean at the nearest points in coordinates normalised to the object.
-    "object": mean over the training clips of the same object, of all where there is none.
+    kind: "index": the mean by point index. "position": the mean at the nearest points in coordinates normalised to the
+    object. "object": the mean over training clips of the same object, or over all if it is new.
     """
     train_maps = true_maps(train).astype(np.float64)
     if kind == "index":
@@ -118,7 +118,7 @@ def mean_maps(train: list[ClipSample], clips: list[ClipSample], kind: str) -> np
 
 
 def mean_map_by_position(points: np.ndarray, train_clouds: list[np.ndarray], train_maps: np.ndarray) -> np.ndarray:
-    """(point,) probability of contact at each point (point, 3), each training map read at its nearest point.
+    """Probability (point,) of contact at points (point, 3): the mean over training maps of their nearest points.
 
     Points and training clouds (point, 3) are normalised to the size of their object; train_maps (clip, point).
     """
@@ -140,7 +140,7 @@ def load_text2hoi(sources: Sources) -> Text2Hoi:
 
 @dataclass(frozen=True)
 class BeforeRefiner:
-    """The motions of Text2HOI as the diffusion network leaves them."""
+    """Text2HOI without its refiner."""
 
     model: Text2Hoi
 
@@ -153,13 +153,10 @@ class BeforeRefiner:
 
 @dataclass(frozen=True)
 class OtherPrompt:
-    """Text2HOI told another clip's sentence: what is then as good does not come from the words.
-
-    other: the clip whose sentence to use instead, by clip; a clip without another sentence has no answer.
-    """
+    """Text2HOI conditioned on another clip's sentence: a control for metrics that should depend on the sentence."""
 
     model: Text2Hoi
-    other: dict[str, ClipSample]
+    other: dict[str, ClipSample]  # by clip id, the clip whose sentence to use; a clip that is absent is skipped
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         return self.sample_asked(requests)[0]
@@ -170,16 +167,17 @@ class OtherPrompt:
         """contact_maps: as in ``Text2Hoi.motions``."""
         answers: list[Clip | LeftOut] = [LeftOut(request.motion_id, NO_OTHER_SENTENCE) for request in requests]
         maps: list[np.ndarray | None] = [None] * len(requests)
-        rows = [row for row, request in enumerate(requests) if request.clip_id in self.other]
-        given = None if contact_maps is None else [contact_maps[row] for row in rows]
-        if rows:
-            made = self.model.sample_asked(self.told([requests[row] for row in rows]), contact_maps=given)
-            for row, clip, contact_map in zip(rows, *made, strict=True):
-                answers[row], maps[row] = clip, contact_map
+        indices = [index for index, request in enumerate(requests) if request.clip_id in self.other]
+        given_maps = None if contact_maps is None else [contact_maps[index] for index in indices]
+        if indices:
+            swapped = self.with_other_sentences([requests[index] for index in indices])
+            motions = self.model.sample_asked(swapped, contact_maps=given_maps)
+            for index, clip, contact_map in zip(indices, *motions, strict=True):
+                answers[index], maps[index] = clip, contact_map
         return answers, maps
 
-    def told(self, requests: Sequence[Request]) -> list[Request]:
-        """The requests with the other sentences."""
+    def with_other_sentences(self, requests: Sequence[Request]) -> list[Request]:
+        """The requests with the other clips' sentences."""
         others = [self.other[request.clip_id] for request in requests]
         return [
             replace(request, sentence=first_sentence(other), text=other.text[0])
@@ -188,19 +186,19 @@ class OtherPrompt:
 
 
 def other_prompts(sources: Sources) -> dict[str, ClipSample]:
-    """For every test clip another whose first sentence it is told: other verb and object if there is one such.
+    """For every test clip, a random other one with another sentence; with another verb and object if possible.
 
-    A clip is absent where all test clips have its sentence.
+    A clip is absent if all test clips have its sentence.
     """
     test = list(HoiDataset(sources.annotated, "test", crop="start"))
-    draws, chosen = np.random.default_rng(0), {}
+    random, chosen = np.random.default_rng(0), {}
     for sample in test:
         other = [s for s in test if s.verb != sample.verb and s.object_key != sample.object_key]
         other = other or [s for s in test if s.sentences[0] != sample.sentences[0]]
         if not other:
             continue
         same_hand = [s for s in other if s.hand_type == sample.hand_type] or other
-        chosen[sample.clip_id] = same_hand[int(draws.integers(len(same_hand)))]
+        chosen[sample.clip_id] = same_hand[int(random.integers(len(same_hand)))]
     return chosen
 
 

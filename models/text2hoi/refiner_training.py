@@ -1,4 +1,4 @@
-"""Training of the hand refiner on motions made by the frozen generator (Text2HOI eq. 8-11)."""
+"""Training of the hand refiner on motions of the frozen generator (Text2HOI, Eq. 8-11)."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -19,63 +19,68 @@ from models.text2hoi.diffusion import Condition, MotionGenerator
 from models.text2hoi.diffusion_training import DIFFUSION, Targets, motion_generator
 from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, Surface
 
-GENERATED_AT_ONCE = 32
+MAX_BATCH_SIZE = 32  # of generated motions
 PER_HAND = ("hands", "joints_m", "distance_m", "offset_m")
 
 
 @dataclass(frozen=True)
 class RefinerLossConfig:
-    """Weights of eq. 10 and 11 beside eq. 9 (1), with lengths in ``unit_m``.
+    """Loss terms and their weights relative to Eq. 9 (weight 1), and the coarse motions to train on."""
 
-    weighting: eq. 9 is the sum of a frame's squared errors; "even" counts their mean. touch: joints near the surface
-    are drawn onto it, as in the paper, or those that truly touch to where they truly are. generated: coarse motions are
-    clips denoised once, whose hands they are to get back, or only half of them; see :class:`RefinerObjective`.
-    exchanged: the other half is made for contact maps of other clips of the object by the same hands, as no generator
-    knows by heart. frames, vertices: how many frames per clip and vertices per hand the surface losses see. samples:
-    coarse motions made per training clip, sampled ones in ``sampler_steps``. field_resolution: of the grids.
-    """
-
+    # Eq. 10, depth of vertices inside the object.
     penetration_weight: float = 1.0
+    # Eq. 11, distance of joints from the surface.
     contact_weight: float = 5.0
+    # Length unit of Eq. 10 and 11.
     unit_m: float = 1.0
-    weighting: Literal["sum", "even"] = "sum"
-    touch: Literal["surface", "truth"] = "surface"
-    generated: Literal["once", "half"] = "once"
-    exchanged: bool = False
+    # Squared errors of a frame (Eq. 9) are summed (the paper) or averaged.
+    weighting: Literal["sum", "mean"] = "sum"
+    # Joints near the surface are pulled onto it (the paper), or touching joints to their recorded distance.
+    contact_target: Literal["surface", "recorded"] = "surface"
+    # Coarse motions are recorded clips, noised and denoised once, with the recorded hands as target; or every second
+    # one is sampled from noise, with itself as target (:class:`RefinerObjective`).
+    coarse_motions: Literal["denoised_once", "half_sampled"] = "denoised_once"
+    # Sample coarse motions for contact maps of other clips with the same object and hand type. The clip's map would
+    # reproduce the training clip.
+    swap_contact_maps: bool = False
+    # Frames per clip on which Eq. 10 and 11 are computed.
     frames: int = 8
+    # Vertices per hand in Eq. 10.
     vertices: int = 259
+    # Coarse motions per training clip.
     samples: int = 4
+    # Denoiser calls of a sampled coarse motion.
     sampler_steps: int = 10
+    # Grid points of the distance grids along each axis.
     field_resolution: int = 40
 
 
 @dataclass(frozen=True)
 class _Coarse:
-    """One generated motion of a clip as the refiner sees it, frame first, and the hands to stay near.
+    """One coarse motion of a clip of F frames, and its targets; frames come first."""
 
-    view: the tensors of :class:`CoarseMotion` that have frames, by name, (F, ...). target: (F, 2, 99), as the network
-    sees hands. true_distance_m: (F, 2, 21) of the joints to the surface in the clip itself.
-    """
-
-    view: dict[str, Tensor]
-    target: Tensor
-    true_distance_m: Tensor
+    view: dict[str, Tensor]  # fields of :class:`CoarseMotion` with a frame axis, (F, ...)
+    target: Tensor  # (F, 2, 99) hands in the refiner's view
+    true_distance_m: Tensor  # (F, 2, 21) of recorded joints to the surface
 
 
 @dataclass(frozen=True)
 class _Comparison:
-    """A batch of coarse motions with what they are compared with; side before frame."""
+    """A batch of coarse motions and their targets; the hand axis comes before frames."""
 
     batch: ClipBatch
     coarse: CoarseMotion
-    target: Tensor
-    true_distance_m: Tensor
+    target: Tensor  # (B, 2, F, 99) hands in the refiner's view
+    true_distance_m: Tensor  # (B, 2, F, 21) of recorded joints to the surface
 
 
 class RefinerObjective:
-    """Half of the coarse motions are clips noised and denoised once: they are to go back to the clip's own hands
-    relative to the object. The others are sampled from noise, as in use, where no true hands exist: they are to stay
-    near themselves. All are to touch as the clip does, and not to penetrate."""
+    """Losses of the refiner: Text2HOI, Eq. 9-11.
+
+    For a recorded clip that was noised and denoised once, the target is the recorded hands relative to the object. A
+    motion sampled from noise has no recorded hands; its target is itself. All motions are trained to touch where the
+    clip does, and not to penetrate.
+    """
 
     entries = 0
 
@@ -92,23 +97,23 @@ class RefinerObjective:
         self.network, self.weights, self.device = network, weights, device
         self.frames = weights.frames
         self.generator, self.surface = generator, surface
-        self.targets = Targets(generator.network.code, generator.normaliser, device)
+        self.targets = Targets(generator.network.representation, generator.normaliser, device)
         self.vertices = torch.arange(0, 778, max(1, 778 // weights.vertices), device=device)
-        draws = torch.Generator().manual_seed(seed)
+        random = torch.Generator().manual_seed(seed)
         train, held_out = list(corpus.train), corpus.held_out
-        self.alike: dict[tuple[str, str], list[np.ndarray]] = {}
+        self.contact_maps: dict[tuple[str, str], list[np.ndarray]] = {}
         for sample in train:
-            self.alike.setdefault((sample.object_key, sample.hand_type), []).append(sample.contact)
-        half = weights.generated == "half"
-        kinds = ["sampled" if half and number % 2 else "once" for number in range(weights.samples)]
+            self.contact_maps.setdefault((sample.object_key, sample.hand_type), []).append(sample.contact)
+        half = weights.coarse_motions == "half_sampled"
+        kinds = ["sampled" if half and number % 2 else "denoised" for number in range(weights.samples)]
         self.pool = {sample.clip_id: [] for sample in train}
         for kind in kinds:
-            for sample, coarse in zip(train, self._make(train, kind, draws), strict=True):
+            for sample, coarse in zip(train, self._coarse_motions(train, kind, random), strict=True):
                 self.pool[sample.clip_id].append(coarse)
         self.held_out: _Comparison | None = None
         if held_out:
-            held = self._make(held_out, kinds[-1], torch.Generator().manual_seed(0))
-            self.held_out = self._batch(collate(held_out, self._sight(held_out)).to(device), held)
+            motions = self._coarse_motions(held_out, kinds[-1], torch.Generator().manual_seed(0))
+            self.held_out = self._batch(collate(held_out, self._selection(held_out)).to(device), motions)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> dict[str, Tensor]:
         numbers = np.random.default_rng(generator.initial_seed()).integers(self.weights.samples, size=len(batch))
@@ -121,23 +126,29 @@ class RefinerObjective:
         assert self.held_out is not None
         return self._losses(network, self.held_out)["total"]
 
-    def _sight(self, samples: list[ClipSample]) -> Sight:
+    def _selection(self, samples: list[ClipSample]) -> Sight:
         return Sight.drawn([sample.length for sample in samples], self.frames, 0, np.random.default_rng(0))
 
-    def _losses(self, network: RefinerModel, seen: _Comparison) -> dict[str, Tensor]:
-        batch, coarse, weights = seen.batch, seen.coarse, self.weights
+    def _losses(self, network: RefinerModel, comparison: _Comparison) -> dict[str, Tensor]:
+        batch, coarse, weights = comparison.batch, comparison.coarse, self.weights
         refined = network(coarse)
-        change = (network.seen(refined, coarse.object) - seen.target) / network.reach
+        change = (network.in_view(refined, coarse.object) - comparison.target) / network.reach
         simple = losses.masked_mean(change.square(), coarse.present[..., None])
         simple = simple * change.shape[-1] if weights.weighting == "sum" else simple
         chosen = batch.chosen
-        present, true = (losses.take_frames(part, chosen, 2) for part in (coarse.present, seen.true_distance_m))
-        skin, inner = self._distances(batch, losses.take_frames(refined, chosen, 2), coarse.object, chosen)
-        penetration = losses.penetration_loss(skin, present, weights.unit_m)
-        if weights.touch == "surface":
-            contact = losses.surface_loss(inner, present, batch.contact_threshold_m, weights.unit_m)
+        present, true_distance = (
+            losses.take_frames(part, chosen, 2) for part in (coarse.present, comparison.true_distance_m)
+        )
+        vertex_distance, joint_distance = self._distances(
+            batch, losses.take_frames(refined, chosen, 2), coarse.object, chosen
+        )
+        penetration = losses.penetration_loss(vertex_distance, present, weights.unit_m)
+        if weights.contact_target == "surface":
+            contact = losses.surface_loss(joint_distance, present, batch.contact_threshold_m, weights.unit_m)
         else:
-            contact = losses.contact_loss(inner, true, present, batch.contact_threshold_m, weights.unit_m)
+            contact = losses.contact_loss(
+                joint_distance, true_distance, present, batch.contact_threshold_m, weights.unit_m
+            )
         total = simple + weights.penetration_weight * penetration
         total = total + weights.contact_weight * contact
         return {"total": total, "simple": simple, "penetration": penetration, "contact": contact}
@@ -147,8 +158,8 @@ class RefinerObjective:
         vertices, joints = self.surface.hands.vertices(hands, batch.betas, batch.template_m)
         points = torch.cat((vertices[..., self.vertices, :], joints), -2)
         _, distance, _ = self.surface.measure(batch, points, losses.take_frames(objects, chosen, 1))
-        skin, inner = distance.split([len(self.vertices), joints.shape[-2]], -1)
-        return skin, inner
+        vertex_distance, joint_distance = distance.split([len(self.vertices), joints.shape[-2]], -1)
+        return vertex_distance, joint_distance
 
     def _batch(self, batch: ClipBatch, motions: list[_Coarse]) -> _Comparison:
         padded = {
@@ -156,54 +167,54 @@ class RefinerObjective:
         }
         objects = padded.pop("object")
         hands = {name: tensor.transpose(1, 2) for name, tensor in padded.items()}
-        target, true = (
+        target, true_distance = (
             pad_sequence([getattr(motion, name) for motion in motions], batch_first=True).transpose(1, 2)
             for name in ("target", "true_distance_m")
         )
-        common = {"present": batch.present, "asked": batch, "contact_map": batch.contact_map}
-        return _Comparison(batch, CoarseMotion(object=objects, **hands, **common), target, true)
+        common = {"present": batch.present, "batch": batch, "contact_map": batch.contact_map}
+        return _Comparison(batch, CoarseMotion(object=objects, **hands, **common), target, true_distance)
 
     @torch.no_grad()
-    def _make(self, samples: list[ClipSample], kind: str, draws: torch.Generator) -> list[_Coarse]:
-        """One coarse motion of every sample, in the samples' order; made in batches of like length."""
+    def _coarse_motions(self, samples: list[ClipSample], kind: str, random: torch.Generator) -> list[_Coarse]:
+        """One coarse motion of every clip, in their order; generated in batches of similar length."""
         order = sorted(range(len(samples)), key=lambda index: samples[index].length)
-        made: dict[int, _Coarse] = {}
-        for start in range(0, len(order), GENERATED_AT_ONCE):
-            rows = order[start : start + GENERATED_AT_ONCE]
-            batch = collate([samples[index] for index in rows]).to(self.device)
-            hands, objects = self._generate(batch, kind, draws)
+        motions: dict[int, _Coarse] = {}
+        for start in range(0, len(order), MAX_BATCH_SIZE):
+            indices = order[start : start + MAX_BATCH_SIZE]
+            batch = collate([samples[index] for index in indices]).to(self.device)
+            hands, objects = self._generate(batch, kind, random)
             coarse = self.surface.coarse(batch, hands, objects, batch.contact_map, batch.present)
-            own = (batch.hands, batch.object) if kind == "once" else (hands, objects)
-            target = self.network.seen(*own).transpose(1, 2)
-            true = self.surface.measure(batch, batch.joints_m, batch.object)[1].transpose(1, 2)
+            target_motion = (batch.hands, batch.object) if kind == "denoised" else (hands, objects)
+            target = self.network.in_view(*target_motion).transpose(1, 2)
+            true_distance = self.surface.measure(batch, batch.joints_m, batch.object)[1].transpose(1, 2)
             view = {name: getattr(coarse, name).transpose(1, 2) for name in PER_HAND} | {"object": objects}
-            for row, index in enumerate(rows):
+            for position, index in enumerate(indices):
                 stop = samples[index].length
-                parts = {name: tensor[row, :stop].clone() for name, tensor in view.items()}
-                made[index] = _Coarse(parts, target[row, :stop].clone(), true[row, :stop].clone())
-        return [made[index] for index in range(len(samples))]
+                parts = {name: tensor[position, :stop].clone() for name, tensor in view.items()}
+                motions[index] = _Coarse(parts, target[position, :stop].clone(), true_distance[position, :stop].clone())
+        return [motions[index] for index in range(len(samples))]
 
-    def _exchanged(self, batch: ClipBatch, draws: torch.Generator) -> Tensor:
-        """(B, 2, N) bool: for every clip the contact of a training clip of its object by the same hands, or its own."""
+    def _swapped_contact(self, batch: ClipBatch, random: torch.Generator) -> Tensor:
+        """Contact maps (B, 2, N) bool of random training clips with the same object and hand type; else the clips'."""
         chosen = []
         for sample in batch.samples:
-            alike = self.alike.get((sample.object_key, sample.hand_type)) or [sample.contact]
-            chosen.append(torch.from_numpy(alike[int(torch.randint(len(alike), (), generator=draws))]))
+            contact_maps = self.contact_maps.get((sample.object_key, sample.hand_type)) or [sample.contact]
+            chosen.append(torch.from_numpy(contact_maps[int(torch.randint(len(contact_maps), (), generator=random))]))
         return send(torch.stack(chosen), self.device)
 
-    def _generate(self, batch: ClipBatch, kind: str, draws: torch.Generator) -> tuple[Tensor, Tensor]:
-        text = any_form(batch, draws)
+    def _generate(self, batch: ClipBatch, kind: str, random: torch.Generator) -> tuple[Tensor, Tensor]:
+        text = any_form(batch, random)
         network = self.generator.network
         condition = Condition.of(batch, network.object_feature(batch.points_m), text, batch.contact)
-        rows = self.targets.of(batch)
+        targets = self.targets.of(batch)
         if kind == "sampled":
-            if self.weights.exchanged:
-                condition = replace(condition, contact=self._exchanged(batch, draws))
+            if self.weights.swap_contact_maps:
+                condition = replace(condition, contact=self._swapped_contact(batch, random))
             sampler = SamplerConfig(steps=self.weights.sampler_steps)
-            noise = draw_motion(rows.hands.shape, rows.object.shape, draws)
-            return self.generator.sample(condition, sampler, noise, draws)
-        steps = send(torch.randint(TRAIN_STEPS, (len(batch),), generator=draws), self.device)
-        return self.generator.denoise_once(rows.hands, rows.object, steps, condition, draws)
+            noise = draw_motion(targets.hands.shape, targets.object.shape, random)
+            return self.generator.sample(condition, sampler, noise, random)
+        steps = send(torch.randint(TRAIN_STEPS, (len(batch),), generator=random), self.device)
+        return self.generator.denoise_once(targets.hands, targets.object, steps, condition, random)
 
 
 def _refiner_objective(setup: Setup) -> tuple[Objective, None]:
@@ -211,9 +222,24 @@ def _refiner_objective(setup: Setup) -> tuple[Objective, None]:
     network = RefinerModel(setup.network).to(setup.device)
     models = [sample.object_model for sample in (*setup.corpus.train, *setup.corpus.held_out)]
     surface = Surface.of(setup.hands, models, setup.loss.field_resolution, setup.device)
-    return RefinerObjective(network, setup.loss, setup.corpus, generator, surface, setup.device, setup.seed), None
+    objective = RefinerObjective(
+        network,
+        weights=setup.loss,
+        corpus=setup.corpus,
+        generator=generator,
+        surface=surface,
+        device=setup.device,
+        seed=setup.seed,
+    )
+    return objective, None
 
 
 REFINER = Network(
-    "refiner", RefinerConfig, RefinerModel, _refiner_objective, RefinerLossConfig, needs=(DIFFUSION.name,), crop="start"
+    "refiner",
+    RefinerConfig,
+    build=RefinerModel,
+    objective=_refiner_objective,
+    loss=RefinerLossConfig,
+    needs=(DIFFUSION.name,),
+    crop="start",
 )

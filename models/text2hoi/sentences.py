@@ -1,4 +1,4 @@
-"""A user's sentence: is it one, and what of it has a model never seen in training?"""
+"""Checks a user's sentence: whether it is English, and which of its words were not in training."""
 
 import re
 from collections.abc import Mapping
@@ -15,14 +15,14 @@ from models.common.vocabulary import Vocabulary
 LONGEST_WORDS = 60
 KNOWN_SHARE = 0.6
 NAMED = 3
-# What the dictionary, which inflects, does not list.
+# Words that the dictionary does not list.
 _FUNCTION_WORDS = """the a an with of to from in on onto into at and or then while it its your my his her their this
 that these those as if for until without using only one two three four five both each every no not towards toward
 beside against but because than nor per upon beneath during ok
 six seven eight nine ten twenty thirty forty fifty sixty ninety"""
 _BETWEEN_CLAUSES = re.compile(r"[,;.&]|\band/or\b|\b(?:and|then)\b")
 _ADVERBS = frozenset({"also", "again", "now", "next", "please", "first"})
-# Words of which a noun follows, however it is written: "a drink" is no verb.
+# A noun follows these words: "drink" in "a drink" is not a verb.
 LEFT_OF_NOUNS = ("a", "an", "the", "this", "that", "these", "those", "my", "your", "his", "her", "their", "its", "our")
 FUNCTION_WORDS = frozenset(re.findall(r"\w+", _FUNCTION_WORDS))
 
@@ -30,7 +30,7 @@ FUNCTION_WORDS = frozenset(re.findall(r"\w+", _FUNCTION_WORDS))
 def unseen_words(
     known: Vocabulary, text: str, verb: str | None, thing: str | None, hand: HandType, encoder: TextEncoder
 ) -> list[str]:
-    """What of a sentence was never in training, each with the nearest that was; in words for a person."""
+    """What of a sentence was not in training, with the most similar training words; in words for the user."""
     thing = thing or _known_object(known, text)
     notes = []
     if not verb or verb not in known.verbs:
@@ -48,7 +48,7 @@ def unseen_words(
 
 
 def _known_object(known: Vocabulary, text: str) -> str | None:
-    """The object of training whose words stand in ``text``, the longest; a sentence with a strange verb is not read."""
+    """The longest name of a training object in ``text``; also found in a sentence with an unknown verb."""
     found = [thing for thing in known.objects if thing and re.search(rf"\b{re.escape(thing)}\b", text.lower())]
     return max(found, key=len, default=None)
 
@@ -61,9 +61,9 @@ def _stranger(kind: str, word: str | None, known: Mapping[str, int], encoder: Te
 
 
 def read_sentence(text: str) -> tuple[str | None, str | None]:
-    """Verb and object of a user's sentence, base forms; None for what no word table knows.
+    """Verb and object of a user's sentence, in base form; None if not in the word tables.
 
-    Raises BadInput for no text, more than 60 words, and what is hardly English.
+    Raises BadInput for an empty text, more than 60 words, and text that is not English.
     """
     words = ["".join(filter(str.isalpha, word)) for word in text.split()]
     words = [word.lower() for word in words if word]
@@ -80,7 +80,7 @@ def read_sentence(text: str) -> tuple[str | None, str | None]:
 
 
 def further_verbs(text: str, made: str | None, known: Vocabulary) -> list[str]:
-    """Verbs of training that a sentence asks for beside the one that is made, as "pour" in "Lift a mug and pour"."""
+    """Training verbs in a sentence in addition to the generated one, such as "pour" in "Lift a mug and pour"."""
     clauses = [re.findall(r"[a-z-]+", clause) for clause in _BETWEEN_CLAUSES.split(text.lower())]
     clauses = [rest for words in clauses if (rest := words[_count_adverbs(words) :])]
     verbs = sorted(filter(None, known.verbs))
@@ -94,12 +94,12 @@ def further_verbs(text: str, made: str | None, known: Vocabulary) -> list[str]:
 
 
 def _count_adverbs(words: list[str]) -> int:
-    """How many words before a clause's verb say when or how."""
+    """Number of adverbs before a clause's verb."""
     return next((n for n, word in enumerate(words) if not (word.endswith("ly") or word in _ADVERBS)), len(words))
 
 
 def _begins_with(words: list[str], verb: str, known: Vocabulary, ordered: bool) -> bool:
-    """Whether words begin with a known verb: in its base form where ``ordered``, and not with an object's name."""
+    """Whether words begin with a known verb, and not with an object's name; in base form if ``ordered``."""
     first, *others = verb.split()
     fits = words[0] == first if ordered else first in getAllLemmas(words[0]).get("VERB", ())
     if not fits or words[0] in known.objects:
@@ -109,7 +109,7 @@ def _begins_with(words: list[str], verb: str, known: Vocabulary, ordered: bool) 
 
 
 def _of_no_article(words: list[str]) -> list[int]:
-    """Where a verb may stand in a clause with its subject: not first, and not as "drink" in "a drink"."""
+    """Positions of a verb in a clause with a subject: not first, and not after an article."""
     return [start for start in range(1, len(words)) if words[start - 1] not in ("a", "an", "the")]
 
 
@@ -118,12 +118,12 @@ def _is_base_form(word: str) -> bool:
 
 
 def is_english(word: str) -> bool:
-    """Whether a lower-case word is in lemminflect's dictionary or a function word. ASCII only: no other script is."""
+    """Whether a lower-case word is in lemminflect's dictionary or a function word; ASCII only."""
     return word.isascii() and (word in FUNCTION_WORDS or bool(getAllLemmas(word)))
 
 
 def nearest_words(word: str, known: list[str], encoder: TextEncoder) -> list[str]:
-    """The known words most like ``word`` in the text encoder's features, best first."""
+    """The known words whose text features are most similar to those of ``word``, best first."""
     features = encoder.encode([word, *known])
     features = features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)
     order = np.argsort(-(features[1:] @ features[0]), kind="stable")[:NAMED]
@@ -131,7 +131,7 @@ def nearest_words(word: str, known: list[str], encoder: TextEncoder) -> list[str
 
 
 def first_verb(text: str) -> str | None:
-    """The first word that the dictionary knows as a verb and that follows no article, in its base form."""
+    """The first word that can be a verb and follows no article, in base form."""
     before = ""
     for word in text.lower().split():
         word = "".join(filter(str.isalpha, word))

@@ -1,10 +1,9 @@
-"""Whether object and hands of a motion do as in training clips of the verb its sentence was read as.
+"""Compares a generated motion with the training clips of its verb: the criterion of rejection sampling.
 
-A sampler draws from what it learnt, now and then a motion of another verb. What the object does is a few numbers
-(``hoidata.actions``), and which verb's training clips do most alike, and within which bounds they do it, needs no test
-clip and no judge: a motion that fails is drawn again. So is one with a joint faster than any of training, which no
-figure of means shows (a sampler's hand may leave for a few frames and come back), and one whose hands slide more over
-an object in motion than in training clips of the verb.
+A few measures describe how the object moves (``hoidata.actions``). A motion is rejected if other verbs' training clips
+move the object more similarly, or if a measure is outside the range of the verb's training clips. It is also rejected
+if a joint is faster than in all training clips, or if hands slip more than in the verb's clips. No test clip and no
+trained evaluator is involved.
 """
 
 from collections.abc import Mapping
@@ -33,7 +32,7 @@ from hoidata.store.annotated import AnnotatedStore
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus
 from models.common.vocabulary import Vocabulary
-from models.text2hoi.verb_reading import readings_of
+from models.text2hoi.verb_classifier import verb_classifiers_of
 
 # Names among the results of a diffusion checkpoint.
 RECORD = "actions"
@@ -42,40 +41,36 @@ JOINT_SPEED = "joint_m_s"
 FASTER = 1.1  # than in any training clip
 SLIP = "slip_cm_s"
 MOST_SLIP = "most_slip_cm_s"
-LEAST_DEVIATION_CM_S = 0.05  # of slip: where recorded hands never slide, a quarter of a millimetre a second is nothing
+LEAST_DEVIATION_CM_S = 0.05  # of slip, for recorded hands that never slip
 
 
 @dataclass(frozen=True)
 class VerbCheck:
-    """actions: of the training clips. threshold_m: how near a joint must come to touch. hands: of the clips.
-
-    fastest_m_s: of a joint in them; infinite for a checkpoint from before it was kept. most_slip_cm_s: by verb, how
-    much hands may slide over an object that moves; nothing is asked of verbs without it.
-    """
+    """Ranges of the training clips, to which motions are compared."""
 
     actions: Actions
-    threshold_m: float
+    threshold_m: float  # distance below which a joint touches
     hands: HandPair
-    fastest_m_s: float = float("inf")
-    most_slip_cm_s: Mapping[str, float] = field(default_factory=dict)
+    fastest_m_s: float = float("inf")  # of any joint; infinite if a checkpoint does not state it
+    most_slip_cm_s: Mapping[str, float] = field(default_factory=dict)  # of hands on a moving object, by verb
 
     @classmethod
     def of(cls, trained: Checkpoint, hands: HandPair) -> "VerbCheck | None":
-        """Of a diffusion checkpoint; None where it is told no verbs, or was written before they were kept."""
+        """From a diffusion checkpoint; None if its network has no verb classifier, or it stores no actions."""
         results = trained.info.get("results", {})
-        if RECORD not in results or not readings_of(trained.network):
+        if RECORD not in results or not verb_classifiers_of(trained.network):
             return None
         return cls.read(results, trained.facts["contact_threshold_m"], hands)
 
     @classmethod
     def read(cls, kept: Mapping[str, Any], threshold_m: float, hands: HandPair) -> "VerbCheck":
-        """From what ``usual_motion`` gave."""
+        """From the result of ``usual_motion``."""
         fastest_m_s = kept.get(FASTEST) or float("inf")  # 0: no hand ever moved, which bounds nothing
         return cls(Actions.read(kept[RECORD]), threshold_m, hands, fastest_m_s, kept.get(MOST_SLIP, {}))
 
     def numbers(self, clip: Clip, points: ObjectPoints) -> dict[str, float]:
-        """What the object does in a clip (``hoidata.actions``), ``JOINT_SPEED``, the fastest joint's, and ``SLIP``, the
-        mean over touching joints.
+        """Measures of a clip: those of its object (``hoidata.actions``), ``JOINT_SPEED`` of the fastest joint, and mean
+        ``SLIP`` of touching joints.
         """
         index, touching, speeds = ProximityIndex(points), np.zeros((len(SIDES), clip.n_frames), bool), [0.0]
         slips = [np.zeros(0)]
@@ -93,61 +88,61 @@ class VerbCheck:
         return action_numbers(clip.object, clip.gravity, touching) | own
 
     def moved_as(self, numbers: Mapping[str, float]) -> str | None:
-        """The verb whose training clips move the object most alike; None where gravity is not known."""
+        """The verb whose training clips have the most similar object motion; None if gravity is not known."""
         return self.actions.named(numbers)
 
     def unusual(self, asked: str | None, numbers: Mapping[str, float]) -> tuple[str, ...]:
-        """Which numbers, in words, lie outside the bounds of the training clips of the verb asked for, or of all."""
+        """Measures outside the range of the requested verb's training clips, in words."""
         found = () if asked is None else self.actions.unusual(asked, numbers)
         above = {name: most for name, most in self._most(asked).items() if numbers[name] > most}
         said = (beside_usual(name, numbers[name], 0.0, most) for name, most in above.items())
         return (*found, *filter(None, said))
 
     def seen(self, asked: str | None, numbers: Mapping[str, float]) -> tuple[str, ...]:
-        """Those of ``unusual`` that a person who watches the motion sees."""
+        """Those of ``unusual`` that are large enough to see."""
         found = () if asked is None else self.actions.seen(asked, numbers)
         above = {name: most for name, most in self._most(asked).items() if is_seen(name, numbers[name], 0.0, most)}
         said = (beside_usual(name, numbers[name], 0.0, most) for name, most in above.items())
         return (*found, *filter(None, said))
 
     def beyond(self, asked: str | None, numbers: Mapping[str, float]) -> float:
-        """How unusual the most unusual number is: outside its bounds by so many of their widths; 0 where none is."""
+        """The largest distance of a measure from its range, in widths of the range; 0 if all are inside."""
         found = [] if asked is None else list(self.actions.beyond(asked, numbers).values())
         return max(0.0, *found, *(numbers[name] / most - 1 for name, most in self._most(asked).items()))
 
     def _most(self, asked: str | None) -> dict[str, float]:
-        """What the hands' numbers may be at most; for them less is never unusual."""
+        """Upper limits of the hands' measures; they have no lower ones."""
         slip = self.most_slip_cm_s.get(asked or "", float("inf"))
         return {JOINT_SPEED: FASTER * self.fastest_m_s, SLIP: slip}
 
     def fails(self, asked: str | None, moved_as: str | None) -> bool:
-        """Whether a motion is of another verb than the one asked for; False where either is not known."""
+        """Whether a motion has another verb than the requested one; False if either is not known."""
         return not (asked is None or moved_as is None or asked not in self.actions.centroids or moved_as == asked)
 
 
-def asked_verb(trained: Checkpoint, request: Request) -> str | None:
-    """The verb that a request's sentence was read as; None where that is not known."""
-    read = read_verb(trained, torch.from_numpy(request.text))
+def requested_verb(trained: Checkpoint, request: Request) -> str | None:
+    """The verb as which a request's sentence is classified; None if not known."""
+    read = classified_verb(trained, torch.from_numpy(request.text))
     return None if read is None else read[0]
 
 
-def read_verb(trained: Checkpoint, text: Tensor) -> tuple[str, float] | None:
-    """The likeliest verb of a sentence with features (512,), and how likely; None where a network is told no verbs."""
-    readings = readings_of(trained.network)
+def classified_verb(trained: Checkpoint, text: Tensor) -> tuple[str, float] | None:
+    """The most probable verb of a sentence with features (512,), and its probability; None without a classifier."""
+    readings = verb_classifiers_of(trained.network)
     verbs = sorted(filter(None, Vocabulary.read(trained.facts).verbs))
     if not readings or not verbs:
         return None
-    probability = readings[0].read(text[None].to(readings[0].mean.device))[0]
+    probability = readings[0].probabilities(text[None].to(readings[0].mean.device))[0]
     return verbs[int(probability.argmax())], round(float(probability.max()), 3)
 
 
 def action_results(network: nn.Module, corpus: Corpus) -> Mapping[str, Any]:
-    """What a diffusion checkpoint keeps of its training clips, where it is told verbs."""
-    return usual_motion(corpus.annotated) if readings_of(network) else {}
+    """What a diffusion checkpoint stores about its training clips, if the network has a verb classifier."""
+    return usual_motion(corpus.annotated) if verb_classifiers_of(network) else {}
 
 
 def usual_motion(store: AnnotatedStore) -> dict[str, Any]:
-    """Of the training clips their actions, how fast hands are, and how much they slide by verb."""
+    """Actions of the training clips, the fastest joint, and the usual slip by verb."""
     speeds, slips = [0.0], dict[str, list[dict[str, float]]]()
     for clip_id in store.ids("train"):
         clip = store.clip(clip_id)
@@ -161,7 +156,7 @@ def usual_motion(store: AnnotatedStore) -> dict[str, Any]:
 
 
 def _recorded_slip_cm_s(store: AnnotatedStore, clip_id: str, thing: ObjectTrack) -> float:
-    """``SLIP`` of a recorded clip and its object, from its kept distances."""
+    """``SLIP`` of a recorded clip, from its stored distances."""
     part, slips = store.points(store.object_key(clip_id)).part, []
     for side in SIDES:
         near = store.distances(clip_id, side)
@@ -175,6 +170,6 @@ def _mean(values: np.ndarray) -> float:
 
 
 def fastest_joint(joints_m: np.ndarray, valid: np.ndarray) -> float:
-    """Speed in m/s of the fastest joint (F, 21, 3) between two frames in which the hand is there, valid (F,) bool."""
+    """Speed in m/s of the fastest joint (F, 21, 3) between two frames that are ``valid`` (F,)."""
     steps = np.linalg.norm(np.diff(joints_m.astype(np.float64), axis=0), axis=2)[valid[1:] & valid[:-1]]
     return float(steps.max(initial=0.0)) * FPS

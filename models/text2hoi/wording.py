@@ -1,7 +1,7 @@
-"""What a user's sentence means to the networks: misspelt words are corrected, a synonym becomes a verb of training.
+"""Prepares a user's sentence for the networks: spelling is corrected, synonyms become verbs of the training clips.
 
-A word that is in no dictionary is replaced where one word of training is a single slip away, which the user is told.
-Everything else that would have to be guessed is refused, with the nearest words.
+A word that is in no dictionary is replaced if exactly one training word is a single edit away; the user is informed.
+Anything else that would need guessing is refused, with suggestions.
 """
 
 import re
@@ -28,12 +28,12 @@ from models.text2hoi.sentences import (
 )
 
 FORCE = "or add --force to generate from the sentence as it is typed"
-# Letters that a slip of the pen is surely one in: in shorter words only two letters that changed places.
-LEAST_LETTERS = 5
-SUGGESTED = 3
+# Words from this length on may have any single edit; shorter ones only two exchanged letters.
+MIN_LETTERS = 5
+MAX_SUGGESTIONS = 3
 LETTERS = "abcdefghijklmnopqrstuvwxyz"
 _WORD = re.compile(r"[^\W\d_]+(?:['’][^\W\d_]+)*")
-# What people say for a verb of the datasets, beside the synonyms of the word table.
+# Paraphrases of training verbs, in addition to the synonyms of the word table.
 PARAPHRASES = {"pick up": "lift", "set down": "place"}
 PARTICLES = frozenset({"down", "up", "out", "off", "in", "on", "over", "away", "back"})
 NO_OBJECTS = frozenset({"hand", "hands", "left hand", "right hand", "person", "man", "woman"})
@@ -44,101 +44,106 @@ _OBJECT = re.compile(rf"\b(?:{'|'.join(LEFT_OF_NOUNS)})\s+(?=((?:[a-z-]+\s*)+))"
 
 @dataclass(frozen=True)
 class Wording:
-    """A sentence as it is understood.
+    """A prepared sentence."""
 
-    text: the sentence with its slips corrected, and a synonym replaced.
-    verb, thing: base forms, None where none was found. The verb is one of training unless the sentence was forced.
-    notes: what was changed, for the user.
-    """
-
-    text: str
-    verb: str | None
-    thing: str | None
-    notes: tuple[str, ...] = ()
+    text: str  # with corrected spelling and replaced synonym
+    verb: str | None  # base form; a verb of the training clips unless forced; None if not found
+    noun: str | None  # the object, base form; None if not found
+    notes: tuple[str, ...] = ()  # what was changed, for the user
 
 
 def understood_words(
-    text: str, known: Vocabulary, encoder: Callable[[], TextEncoder], names: Iterable[str] = (), force: bool = False
+    text: str,
+    vocabulary: Vocabulary,
+    encoder: Callable[[], TextEncoder],
+    names: Iterable[str] = (),
+    force: bool = False,
 ) -> Wording:
-    """The sentence with its verb and object.
+    """Prepare a sentence: correct it, and find its verb and object.
 
-    known: what the models were trained on. encoder: makes what finds words of like meaning, asked only for an error.
-    names: words that are right beside those of the dictionary, as a mesh file's name. force: take the sentence as it
-    is, whatever it holds.
-    Raises BadInput for words that no dictionary has, and for a verb that was never in training, with the nearest.
+    Args:
+        vocabulary: of the training clips.
+        encoder: returns a text encoder for suggestions; called only for an error.
+        names: further words that are spelt correctly, such as the name of a mesh file.
+        force: accept the sentence unchanged, whatever it contains.
+
+    Raises:
+        BadInput: a word is in no dictionary, or the verb was not in training; the message has suggestions.
     """
     notes = list[str]()
     if not force:
-        text, notes = _corrected(text, known, names)
-    verb, thing = read_sentence(text)
-    verbs = sorted(filter(None, known.verbs))
+        text, notes = _corrected(text, vocabulary, names)
+    verb, noun = read_sentence(text)
+    verbs = sorted(filter(None, vocabulary.verbs))
     if verb not in verbs:
         verb = _with_particle(text, [*verbs, *PARAPHRASES, *filter(None, map(synonym_of, verbs))]) or verb
-    if thing in (None, "hand"):
-        thing = _phrase_after_article(text, verb)
-    trained = next((own for own in verbs if verb and own in (synonym_of(verb), PARAPHRASES.get(verb))), None)
-    if verb not in verbs and trained:
-        notes.append(f"{verb!r} is read as {trained!r}")
-        text, verb = _replaced(text, str(verb), trained), trained
+    if noun in (None, "hand"):
+        noun = _phrase_after_article(text, verb)
+    synonyms = (synonym_of(verb), PARAPHRASES.get(verb)) if verb else ()
+    trained_synonym = next((candidate for candidate in verbs if candidate in synonyms), None)
+    if verb not in verbs and trained_synonym:
+        notes.append(f"{verb!r} is read as {trained_synonym!r}")
+        text, verb = _replaced(text, str(verb), trained_synonym), trained_synonym
     if verbs and verb not in verbs and not force:
         raise _untrained(verb or first_verb(text), text, verbs, encoder)
-    return Wording(text, verb, thing, tuple(notes))
+    return Wording(text, verb, noun, tuple(notes))
 
 
 def _untrained(word: str | None, text: str, verbs: Sequence[str], encoder: Callable[[], TextEncoder]) -> BadInput:
-    """The error for a verb that no model was trained on; ``word`` is None where the sentence has no verb."""
+    """The error for a verb that no model was trained on; ``word`` is None if the sentence has no verb."""
     expected = f"a verb that the models were trained on ({', '.join(verbs)})"
     first = word or _plain(_WORD.findall(text)[0])
     spelt = [verb for _, verb in _near(first, verbs, 2)]
-    begins = [verb for verb in verbs if verb.split()[0] == word]
-    alike = nearest_words(word, list(verbs), encoder()) if word else []
-    near = list(dict.fromkeys([*begins, *spelt, *alike]))[:SUGGESTED]
-    meant = f"did you mean {_either(near)}? Take" if near else "name what the hands do with"
-    return BadInput("the sentence", expected, repr(word) if word else "none", f"{meant} one of them, {FORCE}")
+    same_beginning = [verb for verb in verbs if verb.split()[0] == word]
+    similar = nearest_words(word, list(verbs), encoder()) if word else []
+    suggestions = list(dict.fromkeys([*same_beginning, *spelt, *similar]))[:MAX_SUGGESTIONS]
+    suggestion = f"did you mean {_either(suggestions)}? Take" if suggestions else "name what the hands do with"
+    return BadInput("the sentence", expected, repr(word) if word else "none", f"{suggestion} one of them, {FORCE}")
 
 
-def _corrected(text: str, known: Vocabulary, names: Iterable[str]) -> tuple[str, list[str]]:
-    """The text with every word that is in no dictionary replaced by the one word of training that it can be."""
-    named = {word for name in names for word in re.findall(r"[a-z]+", name.lower())}
-    wanted, notes = _trained_words(known), list[str]()
+def _corrected(text: str, vocabulary: Vocabulary, names: Iterable[str]) -> tuple[str, list[str]]:
+    """The text with misspelt words replaced by training words, and a note for each."""
+    in_names = {word for name in names for word in re.findall(r"[a-z]+", name.lower())}
+    trained, notes = _trained_words(vocabulary), list[str]()
 
-    def right(found: re.Match[str]) -> str:
-        word, _, rest = found[0].replace("’", "'").partition("'")
-        plain = _plain(word)
-        is_name = len(word) == 1 or (found.start() > 0 and word != word.lower())
-        is_word = plain in named | wanted | _table_words() or is_english(plain)
-        if is_name or is_word or (rest and rest != "s"):
-            return found[0]
-        near = _near(plain, wanted, 2)
-        sure = [own for distance, own in near if distance == 1 and _is_slip(plain, own)]
-        if len(sure) != 1 or sum(distance == 1 for distance, _ in near) != 1:
-            if not sure and _is_compound(plain):
-                return found[0]
-            raise _unknown(word, [own for _, own in near] + _english_near(plain))
-        notes.append(f"{word!r} is read as {sure[0]!r}")
-        own = sure[0].capitalize() if word[0].isupper() else sure[0]
-        return found[0].replace(word, own, 1)
+    def corrected_word(match: re.Match[str]) -> str:
+        word, _, rest = match[0].replace("’", "'").partition("'")
+        lower_case = _plain(word)
+        may_be_name = len(word) == 1 or (match.start() > 0 and word != word.lower())
+        is_word = lower_case in in_names | trained | _table_words() or is_english(lower_case)
+        if may_be_name or is_word or (rest and rest != "s"):
+            return match[0]
+        candidates = _near(lower_case, trained, 2)
+        one_edit_away = [candidate for distance, candidate in candidates if distance == 1]
+        corrections = [candidate for candidate in one_edit_away if _is_slip(lower_case, candidate)]
+        if len(corrections) != 1 or len(one_edit_away) != 1:
+            if not corrections and _is_compound(lower_case):
+                return match[0]
+            raise _unknown(word, [candidate for _, candidate in candidates] + _english_near(lower_case))
+        notes.append(f"{word!r} is read as {corrections[0]!r}")
+        correction = corrections[0].capitalize() if word[0].isupper() else corrections[0]
+        return match[0].replace(word, correction, 1)
 
-    return _WORD.sub(right, text), notes
+    return _WORD.sub(corrected_word, text), notes
 
 
-def _unknown(word: str, near: Sequence[str]) -> BadInput:
-    near = list(dict.fromkeys(near))[:SUGGESTED]
-    meant = f"did you mean {_either(near)}? Correct it" if near else "write it otherwise"
-    return BadInput("the sentence", "English words", repr(word), f"{meant}, {FORCE}")
+def _unknown(word: str, candidates: Sequence[str]) -> BadInput:
+    candidates = list(dict.fromkeys(candidates))[:MAX_SUGGESTIONS]
+    suggestion = f"did you mean {_either(candidates)}? Correct it" if candidates else "write it otherwise"
+    return BadInput("the sentence", "English words", repr(word), f"{suggestion}, {FORCE}")
 
 
 def _plain(word: str) -> str:
-    """Lower case and without accents, as the dictionary has its words: "Café" is "cafe"."""
+    """Lower case without accents, as in the dictionary: "Café" becomes "cafe"."""
     decomposed = unicodedata.normalize("NFKD", word.lower())
     return "".join(letter for letter in decomposed if not unicodedata.combining(letter))
 
 
-def _trained_words(known: Vocabulary) -> frozenset[str]:
-    """Single words of what training had: every form of its verbs and their synonyms, its objects, words for hands."""
-    verbs = [verb for verb in known.verbs if verb]
+def _trained_words(vocabulary: Vocabulary) -> frozenset[str]:
+    """All single words of training sentences: forms of verbs and their synonyms, objects, words for hands."""
+    verbs = [verb for verb in vocabulary.verbs if verb]
     forms = [form for verb in [*verbs, *filter(None, map(synonym_of, verbs))] for form in forms_of(verb)]
-    words = " ".join([*forms, *known.objects, *PHRASES.values(), *LEFT_OF_NOUNS, "hands from two using"])
+    words = " ".join([*forms, *vocabulary.objects, *PHRASES.values(), *LEFT_OF_NOUNS, "hands from two using"])
     return frozenset(re.findall(r"[a-z]+", words.lower()))
 
 
@@ -151,7 +156,7 @@ def _table_words() -> frozenset[str]:
 
 @cache
 def synonym_of(verb: str) -> str | None:
-    """The other verb of a pair of synonyms in the word table, either way: lift and raise."""
+    """The synonym of a verb in the word table, in either direction: lift and raise."""
     pairs = default_phrases().synonyms
     return pairs.get(verb) or next((base for base, other in pairs.items() if other == verb), None)
 
@@ -161,81 +166,83 @@ def forms_of(verb: str) -> tuple[str, str, str, str]:
     return default_grammar().verb(verb).forms
 
 
-def _near(word: str, known: Iterable[str], most: int) -> list[tuple[int, str]]:
-    """Known words at most so many edits away, the nearest first."""
-    found = [(edits(word, own, most), own) for own in known]
-    return sorted(item for item in found if item[0] <= min(most, max(1, len(word) // 3)))
+def _near(word: str, candidates: Iterable[str], max_edits: int) -> list[tuple[int, str]]:
+    """Candidates at most ``max_edits`` edits away, with their distance; the nearest first."""
+    near = [(edit_distance(word, candidate, max_edits), candidate) for candidate in candidates]
+    return sorted(item for item in near if item[0] <= min(max_edits, max(1, len(word) // 3)))
 
 
 def _is_compound(word: str) -> bool:
-    """Whether a word is made of two English ones, as "smartphone"."""
-    return any(is_english(word[:place]) and "NOUN" in getAllLemmas(word[place:]) for place in range(3, len(word) - 2))
+    """Whether a word is a compound of two English words, such as "smartphone"."""
+    splits = [(word[:position], word[position:]) for position in range(3, len(word) - 2)]
+    return any(is_english(head) and "NOUN" in getAllLemmas(tail) for head, tail in splits)
 
 
-def _is_slip(word: str, own: str) -> bool:
-    """Whether one edit between two words is surely a slip: of a long word, or two letters that changed places."""
-    return len(word) >= LEAST_LETTERS or sorted(word) == sorted(own)
+def _is_slip(word: str, candidate: str) -> bool:
+    """Whether one edit between two words is a typing error: the word is long, or two letters are exchanged."""
+    return len(word) >= MIN_LETTERS or sorted(word) == sorted(candidate)
 
 
 def _english_near(word: str) -> list[str]:
-    """English nouns and verbs one edit away, in order of the alphabet."""
-    cuts = [(word[:place], word[place:]) for place in range(len(word) + 1)]
-    made = {head + tail[1:] for head, tail in cuts if tail}
-    made |= {head + tail[1] + tail[0] + tail[2:] for head, tail in cuts if len(tail) > 1}
-    made |= {head + letter + tail[1:] for head, tail in cuts if tail for letter in LETTERS}
-    made |= {head + letter + tail for head, tail in cuts for letter in LETTERS}
-    return sorted(own for own in made if {"NOUN", "VERB"} & set(getAllLemmas(own)))
+    """English nouns and verbs one edit away, in alphabetical order."""
+    cuts = [(word[:position], word[position:]) for position in range(len(word) + 1)]
+    variants = {head + tail[1:] for head, tail in cuts if tail}
+    variants |= {head + tail[1] + tail[0] + tail[2:] for head, tail in cuts if len(tail) > 1}
+    variants |= {head + letter + tail[1:] for head, tail in cuts if tail for letter in LETTERS}
+    variants |= {head + letter + tail for head, tail in cuts for letter in LETTERS}
+    return sorted(variant for variant in variants if {"NOUN", "VERB"} & set(getAllLemmas(variant)))
 
 
-def edits(one: str, other: str, most: int) -> int:
-    """Letters to insert, delete, replace or exchange with a neighbour (Damerau 1964, optimal string alignment).
-
-    ``most`` + 1 for words that are farther apart than ``most``.
-    """
-    if abs(len(one) - len(other)) > most:
-        return most + 1
+def edit_distance(one: str, other: str, limit: int) -> int:
+    """Damerau-Levenshtein distance (optimal string alignment), at most ``limit`` + 1."""
+    if abs(len(one) - len(other)) > limit:
+        return limit + 1
     before, row = list[int](), list(range(len(other) + 1))
     for i, letter in enumerate(one, 1):
         above, before, row = before, row, [i]
-        for j, own in enumerate(other, 1):
-            cost = min(before[j] + 1, row[j - 1] + 1, before[j - 1] + (letter != own))
-            if i > 1 and j > 1 and letter == other[j - 2] and one[i - 2] == own:
+        for j, other_letter in enumerate(other, 1):
+            cost = min(before[j] + 1, row[j - 1] + 1, before[j - 1] + (letter != other_letter))
+            if i > 1 and j > 1 and letter == other[j - 2] and one[i - 2] == other_letter:
                 cost = min(cost, above[j - 2] + 1)
             row.append(cost)
-    return min(row[-1], most + 1)
+    return min(row[-1], limit + 1)
 
 
 def _with_particle(text: str, verbs: Iterable[str]) -> str | None:
-    """The verb of several words that stand apart in the text, as "put down" in "Put the mug down"."""
+    """The verb whose words are separated in the text, such as "put down" in "Put the mug down"."""
     words = re.findall(r"[a-z-]+", HAND_PHRASE.sub(" ", text.lower()))
-    for verb in sorted(filter(lambda own: " " in own, verbs), key=len, reverse=True):
+    for verb in sorted(filter(lambda particle: " " in particle, verbs), key=len, reverse=True):
         head, *rest = verb.split()
         for start, word in enumerate(words):
             is_noun = start > 0 and words[start - 1] in LEFT_OF_NOUNS
             after = words[start + 1 : start + 1 + _PARTICLE_WITHIN]
-            if not is_noun and head in getAllLemmas(word).get("VERB", ()) and all(own in after for own in rest):
+            if (
+                not is_noun
+                and head in getAllLemmas(word).get("VERB", ())
+                and all(particle in after for particle in rest)
+            ):
                 return verb
     return None
 
 
 def _replaced(text: str, verb: str, trained: str) -> str:
-    """The text with a trained verb in the place of its synonym, in the same form; unchanged where words stand apart."""
+    """The text with a synonym replaced by a training verb in the same form; unchanged if its words are separated."""
     new_forms = forms_of(trained)
-    for form, own in zip(forms_of(verb), new_forms, strict=True):
-        found = re.search(rf"\b{re.escape(form)}\b", text, re.IGNORECASE)
-        if found:
+    for form, new_form in zip(forms_of(verb), new_forms, strict=True):
+        match = re.search(rf"\b{re.escape(form)}\b", text, re.IGNORECASE)
+        if match:
             # "put down" is base form and participle.
-            own = new_forms[2] if form == forms_of(verb)[2] and _IS.search(text[: found.start()]) else own
-            new = own.capitalize() if found[0][0].isupper() else own
-            return text[: found.start()] + new + text[found.end() :]
+            new_form = new_forms[2] if form == forms_of(verb)[2] and _IS.search(text[: match.start()]) else new_form
+            replacement = new_form.capitalize() if match[0][0].isupper() else new_form
+            return text[: match.start()] + replacement + text[match.end() :]
     return text
 
 
 def _phrase_after_article(text: str, verb: str | None) -> str | None:
-    """What an object of no word table is called: the words between an article and what cannot be part of a name."""
+    """The name of an object that is in no word table: the words from an article to the end of the noun phrase."""
     rest, forms = HAND_PHRASE.sub(" . ", text.lower()), forms_of(verb) if verb else ()
-    for found in _OBJECT.finditer(rest):
-        words = found[1].split()
+    for match in _OBJECT.finditer(rest):
+        words = match[1].split()
         stop = next((number for number, word in enumerate(words) if _ends_a_name(word) or word in forms), len(words))
         phrase = " ".join(words[:stop])
         if phrase and phrase not in NO_OBJECTS:

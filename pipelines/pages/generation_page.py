@@ -29,6 +29,7 @@ ARRAYS = {
     "contact_part": "(P,) 1 where the hinge moves the point",
     "contact": "(P,) the contact map the motion was made for",
 }
+REFINED_BY = {"contact_refinement": "contact refinement by optimisation", "network": "the refiner network"}
 
 
 def write_generation(
@@ -130,7 +131,7 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
         ],
         *([("drawn again", "; ".join(drawn))] if drawn else []),
         ("trained on", clips),
-        ("refined by", {"hold": "a hold against the object", "network": "the refiner network"}[evidence["refined_by"]]),
+        ("refined by", REFINED_BY[evidence["refined_by"]]),
         ("checkpoints", f"{checkpoints} (sha256: {digests})"),
         *[("never seen", note) for note in evidence["unseen"]],
     ]

@@ -21,7 +21,7 @@ class TrainParams:
     """preset: which method; size: which sizes and budgets, laid over it. Each has a section per network, whose keys the
     network checks.
 
-    processes: how many train one network together; ``training.parts`` says what each step computes.
+    processes: how many train one network together; ``training.micro_batches`` says what each step computes.
     """
 
     preset: Literal["paper", "ours"]

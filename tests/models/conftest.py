@@ -1,4 +1,4 @@
-"""A small annotated dataset for the models: hands that come to an object, carry it, and let go."""
+"""A small annotated dataset for the models: hands approach an object, carry it and release it."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +25,7 @@ BOX, FOLDER = box_model((0.06, 0.06, 0.1)), notebook(0.02)
 
 
 @dataclass(frozen=True)
-class Plan:
+class ToyMotion:
     subject: str
     verb: str
     model: ObjectModel
@@ -36,51 +36,53 @@ class Plan:
     eased: bool = False
 
 
-PLANS = (
-    Plan("s1", "lift", BOX, True, False, 24),
-    Plan("s1", "pass", BOX, False, True, 32),
-    Plan("s1", "open", FOLDER, True, True, 28),
-    Plan("s2", "lift", BOX, False, True, 25),
-    Plan("s2", "open", FOLDER, True, True, 27),
-    Plan("s3", "lift", BOX, True, False, 24),
-    Plan("s3", "pass", BOX, False, True, 33),
+TOY_MOTIONS = (
+    ToyMotion("s1", "lift", BOX, left=True, right=False, frames=24),
+    ToyMotion("s1", "pass", BOX, left=False, right=True, frames=32),
+    ToyMotion("s1", "open", FOLDER, left=True, right=True, frames=28),
+    ToyMotion("s2", "lift", BOX, left=False, right=True, frames=25),
+    ToyMotion("s2", "open", FOLDER, left=True, right=True, frames=27),
+    ToyMotion("s3", "lift", BOX, left=True, right=False, frames=24),
+    ToyMotion("s3", "pass", BOX, left=False, right=True, frames=33),
 )
 
 
-def eased(share: np.ndarray) -> np.ndarray:
-    """From 0 to 1 as ``share`` does, with no speed at either end."""
-    return (1 - np.cos(np.pi * share.clip(0, 1))) / 2
+def eased(fraction: np.ndarray) -> np.ndarray:
+    """``fraction`` from 0 to 1 with zero speed at both ends."""
+    return (1 - np.cos(np.pi * fraction.clip(0, 1))) / 2
 
 
-def make_clip(number: int, plan: Plan) -> Clip:
-    """Acting hands rest ``height_m`` above the object in the middle of the clip, or, eased, in the half of it in which
-    the object moves, without jerks; others stay a metre away."""
+def make_clip(number: int, plan: ToyMotion) -> Clip:
+    """Active hands are ``height_m`` above the object in the middle of the clip; inactive hands are a metre away.
+
+    With ``eased``, the object moves smoothly in half of the clip, with hands on it all that time.
+    """
     frames = plan.frames
-    away, done = np.abs(np.linspace(-1, 1, frames)), np.linspace(0, 1, frames)
+    height, done = np.abs(np.linspace(-1, 1, frames)), np.linspace(0, 1, frames)
     if plan.eased:
-        away, done = eased(2 * away - 1), eased(2 * done - 0.5)
-    away, path = 0.1 * away, np.zeros((frames, 3))
+        height, done = eased(2 * height - 1), eased(2 * done - 0.5)
+    height, path = 0.1 * height, np.zeros((frames, 3))
     path[:, 2 if plan.verb == "lift" else 0] = 0.2 * done
     start = np.array([0.3, -0.2, 0.9])
     top = float(plan.model.vertices_m[:, 2].max()) + plan.height_m
     hands = {}
     for side, active_hands, shift in (("left", plan.left, -0.04), ("right", plan.right, 0.04)):
-        wrist = path + start + np.array([shift, 0, top]) + away[:, None] * np.array([0, 0, 1.0])
+        wrist = path + start + np.array([shift, 0, top]) + height[:, None] * np.array([0, 0, 1.0])
         orient = np.tile(np.array([0.1 * number, 0.2, 0.0]), (frames, 1))
         track = flat_hand(wrist if active_hands else wrist + 1)
         pose, betas = np.full((frames, 45), 0.05, np.float32), np.full((1, 10), 0.3, np.float32)
         hands[side] = replace(track, global_orient=orient.astype(np.float32), hand_pose=pose, betas=betas)
     hinge = np.linspace(0, 0.6, frames).astype(np.float32) if plan.model.is_articulated else None
-    turn = np.zeros((frames, 3), np.float32)
-    turn[:, 2] = np.linspace(0, 0.5, frames)
-    track = ObjectTrack(plan.model, turn, (path + start).astype(np.float32), hinge)
+    rotvec = np.zeros((frames, 3), np.float32)
+    rotvec[:, 2] = np.linspace(0, 0.5, frames)
+    track = ObjectTrack(plan.model, rotvec, (path + start).astype(np.float32), hinge)
     return clip_of(f"toy/{plan.subject}/{number}", track, hands, verb=plan.verb)
 
 
 @pytest.fixture(scope="session")
 def annotated_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = [make_clip(number, plan) for number, plan in enumerate(PLANS)]
-    return write_annotated(tmp_path_factory.mktemp("toy"), made)
+    clips = [make_clip(number, plan) for number, plan in enumerate(TOY_MOTIONS)]
+    return write_annotated(tmp_path_factory.mktemp("toy"), clips)
 
 
 @pytest.fixture(scope="session")
@@ -96,7 +98,7 @@ def batch(annotated: AnnotatedStore) -> ClipBatch:
 
 @pytest.fixture(scope="session")
 def trained(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a checkpoint of each of Text2HOI's networks, of the toy dataset."""
+    """A folder with a checkpoint of each of Text2HOI's networks, trained on the toy dataset."""
     out = tmp_path_factory.mktemp("checkpoints")
     for name in PARAMS:
         train(name, annotated_root, out)
@@ -105,11 +107,11 @@ def trained(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 @pytest.fixture(scope="session")
 def sources(annotated: AnnotatedStore, trained: Path) -> Sources:
-    return Sources(annotated, trained, load_embedded_hands(), torch.device("cpu"), FAST)
+    return Sources(annotated, trained, load_embedded_hands(), device=torch.device("cpu"), settings=FAST)
 
 
 @pytest.fixture(scope="session")
 def samples(annotated: AnnotatedStore) -> list[ClipSample]:
-    """A folder opened by both hands, a box lifted by the left one."""
-    every = [sample for split in ("train", "test") for sample in HoiDataset(annotated, split, crop="start")]
-    return [next(one for one in every if one.hand_type == hand) for hand in ("both", "left")]
+    """A folder opened by both hands, and a box lifted by the left one."""
+    all_samples = [clip for split in ("train", "test") for clip in HoiDataset(annotated, split, crop="start")]
+    return [next(clip for clip in all_samples if clip.hand_type == hand) for hand in ("both", "left")]

@@ -106,7 +106,7 @@ def test_a_held_lookup_is_the_lookup_with_the_hold_that_ours_has(sources, test):
 def test_a_held_lookup_is_looked_up_again_by_the_rules_of_ours(sources, test, monkeypatch):
     """The next clip of the ranking; the least unusual of them where none is usual."""
     sample, several = test[0], requests_for(test[0], PredictionConfig(samples=2))
-    family = HeldLookup.load(NEAREST_CLIP, replace(sources, settings={"text2hoi": {"draws": 3}}))
+    family = HeldLookup.load(NEAREST_CLIP, replace(sources, settings={"text2hoi": {"max_attempts": 3}}))
     plain = NEAREST_CLIP.load(sources)
     ranked = [plain.sample([replace(several[0], number=number)])[0] for number in range(6)]
     places = [hold_clip(HANDS, own, HoldSettings()).object.translation_m for own in ranked]
@@ -352,9 +352,10 @@ def test_own_contact_is_the_map_of_the_own_prompt_and_the_motion_of_another(sour
     assert isinstance(family, OwnContact)
     asked = asked_for(test[0])
     (first, _), maps = family.sample_asked(asked)
-    own = family.told_otherwise.model.contact_maps(asked)
+    own = family.other_prompt.model.contact_maps(asked)
     np.testing.assert_array_equal(maps, np.stack([contact_map.amax(0).numpy() > 0 for contact_map in own]))
     (told, _) = other.sample(asked)
     assert isinstance(told, Clip)
-    if not torch.equal(own[0], family.told_otherwise.model.contact_maps(family.told_otherwise.told(asked))[0]):
+    swapped = family.other_prompt.with_other_sentences(asked)
+    if not torch.equal(own[0], family.other_prompt.model.contact_maps(swapped)[0]):
         assert abs(joints(first, acting(test[0])) - joints(told, acting(test[0]))).max() > 0

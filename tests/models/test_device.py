@@ -1,6 +1,6 @@
-"""What a GPU would run waits for no value and mixes no devices; known without one (see ``fake_device``).
+"""Training and sampling read no GPU value on the host and mix no devices, checked without a GPU (``fake_device``).
 
-The device is asked for in one word; what is not there is said, never silently replaced.
+The setting ``device`` is one word; a missing device is an error.
 """
 
 import json
@@ -21,14 +21,14 @@ NAMES = [
         for name in ("contact", "length", "diffusion", "refiner")
     ),
     *(f"sample and refine by {kind}, guidance {scale}" for kind in ("ddim", "ddpm", "dpm++") for scale in (1, 2)),
-    "generate rows of ours",
+    "decode control points of ours",
     "sample lengths",
 ]
 
 
 @pytest.fixture(scope="module")
-def said(annotated_root: Path, trained: Path) -> dict[str, str]:
-    """What each path raised, "" where it ran through."""
+def errors(annotated_root: Path, trained: Path) -> dict[str, str]:
+    """The error of each path, or ""."""
     command = [sys.executable, "-m", "tests.models.fake_device", str(annotated_root), str(trained)]
     done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[2])
     assert done.returncode == 0, done.stderr
@@ -37,27 +37,27 @@ def said(annotated_root: Path, trained: Path) -> dict[str, str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_a_path_runs_on_a_device_without_data(said: dict[str, str], name: str) -> None:
-    assert said[name] == ""
+def test_a_path_runs_on_a_device_without_data(errors: dict[str, str], name: str) -> None:
+    assert errors[name] == ""
 
 
 @pytest.mark.slow
-def test_waiting_for_a_value_and_mixing_devices_would_be_noticed(said: dict[str, str]) -> None:
-    assert said["a value that is waited for"].startswith("DataDependentOutputException")
-    assert said["tensors of two devices"].startswith("FakeTensorDeviceMismatchError")
-    assert said["a copy that is waited for"].startswith("RuntimeError: a copy that is waited for")
-    noticed = {"a value that is waited for", "a copy that is waited for", "tensors of two devices"}
-    assert set(said) == {*NAMES, *noticed}
+def test_reading_a_value_and_mixing_devices_are_detected(errors: dict[str, str]) -> None:
+    assert errors["a value read on the host"].startswith("DataDependentOutputException")
+    assert errors["tensors of two devices"].startswith("FakeTensorDeviceMismatchError")
+    assert errors["a blocking copy"].startswith("RuntimeError: a blocking copy")
+    noticed = {"a value read on the host", "a blocking copy", "tensors of two devices"}
+    assert set(errors) == {*NAMES, *noticed}
 
 
 @pytest.mark.parametrize("present", [True, False])
-def test_auto_takes_a_gpu_where_there_is_one(monkeypatch, present: bool):
+def test_auto_is_a_gpu_if_there_is_one(monkeypatch, present: bool):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: present)
     assert chosen_device("auto") == ("cuda" if present else "cpu")
     assert chosen_device("cpu") == "cpu"
 
 
-def test_cuda_is_refused_where_there_is_none(monkeypatch):
+def test_cuda_is_refused_without_a_gpu(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert chosen_device("cuda") == "cuda"
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)

@@ -1,4 +1,4 @@
-"""A training that meets a number that is not finite stops at once, says where, and loses nothing that was good."""
+"""A training with a non-finite number stops immediately, reports it, and saves the last good weights."""
 
 import json
 import math
@@ -33,19 +33,19 @@ LAST_GOOD = Path("progress", "last_good", "model.safetensors")
 
 
 def changed(network: Network, change: Callable[[int, Tensor, Setup], Tensor], validation: bool = False) -> Network:
-    """The network with ``change(call, value, setup)`` of its total loss, or of its validation loss, call by call."""
+    """The network with its total loss, or its validation loss, replaced by ``change(call, value, setup)``."""
 
     def objective(setup: Setup):
-        made, normaliser = network.objective(setup)
-        losses, weigh, calls = made.losses, made.validation, iter(range(1, 10_000))
+        inner, normaliser = network.objective(setup)
+        losses, validation_loss, calls = inner.losses, inner.validation, iter(range(1, 10_000))
 
         def changed_losses(batch, generator):
-            found = losses(batch, generator)
-            return {**found, "total": change(next(calls), found["total"], setup)}
+            terms = losses(batch, generator)
+            return {**terms, "total": change(next(calls), terms["total"], setup)}
 
-        replaced = lambda kept: change(next(calls), weigh(kept), setup)  # noqa: E731
-        setattr(made, *(("validation", replaced) if validation else ("losses", changed_losses)))
-        return made, normaliser
+        replaced = lambda network_now: change(next(calls), validation_loss(network_now), setup)  # noqa: E731
+        setattr(inner, *(("validation", replaced) if validation else ("losses", changed_losses)))
+        return inner, normaliser
 
     return replace(network, objective=objective)
 
@@ -73,10 +73,10 @@ def out(trained: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", [pytest.param("contact", marks=pytest.mark.slow), "length"])
-def test_a_training_stops_at_the_first_loss_that_is_no_number_and_keeps_the_best_weights(
+def test_a_training_stops_at_the_first_non_finite_loss_and_saves_the_best_weights(
     annotated_root: Path, out: Path, name: str
 ) -> None:
-    """Whole trainings of one, two, ... steps at a constant learning rate have the weights of its validations."""
+    """At a constant learning rate, a training of n steps has the weights of the n-th validation."""
     settings = {"validate_every": 1, "keep_best": True, "learning_rate": 0.25, "save_every": 3}
     calls = []
 
@@ -94,58 +94,58 @@ def test_a_training_stops_at_the_first_loss_that_is_no_number_and_keeps_the_best
         train(changed(load_network(name), counted), annotated_root, out, steps=50, **settings)
     assert calls == [1, 2, 3, 4, 5, 6]
     assert not (out / "made").exists()
-    found = load_checkpoint(out / LAST_GOOD, load_network(name))
+    last_good = load_checkpoint(out / LAST_GOOD, load_network(name))
     (out / "plain").mkdir()
     (out / "plain" / "needed").symlink_to(out / "needed")
     train(load_network(name), annotated_root, out / "plain", steps=5, **settings)
     expected = load_checkpoint(out / "plain" / "made", load_network(name))
     weights = expected.network.state_dict()
-    assert all(torch.equal(value, weights[key]) for key, value in found.network.state_dict().items())
+    assert all(torch.equal(value, weights[key]) for key, value in last_good.network.state_dict().items())
     best = np.genfromtxt(out / "progress" / "log.csv", delimiter=",", names=True)
-    assert found.facts["steps"] == best["step"][best["validation"].argmin()]
-    assert found.info["results"]["validation_loss"] == pytest.approx(best["validation"].min(), rel=1e-5)
+    assert last_good.facts["steps"] == best["step"][best["validation"].argmin()]
+    assert last_good.info["results"]["validation_loss"] == pytest.approx(best["validation"].min(), rel=1e-5)
 
 
-def test_weights_that_are_no_numbers_are_never_saved_and_the_next_run_goes_on_from_good_ones(
+def test_non_finite_weights_are_never_saved_and_the_next_run_resumes_from_finite_ones(
     annotated_root: Path, out: Path, capfd: pytest.CaptureFixture
 ) -> None:
-    """A finite loss whose gradient is none: the square root of zero times a weight."""
+    """A finite loss with an infinite gradient: the square root of zero times a weight."""
 
     def without_gradient(call: int, value: Tensor, setup: Setup) -> Tensor:
         return value + (value - value.detach()).abs().sqrt() if call == 4 else value
 
     network = changed(load_network("length"), without_gradient)
     settings = {"steps": 50, "save_every": 1, "validate_every": 50}
-    for at_call, said in ((4, ""), (1, "goes on after step 3")):
+    for at_call, message in ((4, ""), (1, "resumes after step 3")):
         network = network if at_call == 4 else changed(load_network("length"), nan_at(1))
         with pytest.raises(BadInput, match=r"at step 4 of 50; lower.*the last good weights, of step 3"):
             train(network, annotated_root, out, **settings)
-        assert said in capfd.readouterr().err
+        assert message in capfd.readouterr().err
         state = load_file(out / "progress" / "state.safetensors")
         assert step_of(out / "progress" / "state.safetensors") == 3
         assert all(bool(value.isfinite().all()) for value in state.values())
-    kept = load_file(out / LAST_GOOD)
-    assert all(torch.equal(value, state[f"kept/{key.removeprefix('weights.')}"]) for key, value in kept.items())
+    last_good = load_file(out / LAST_GOOD)
+    assert all(torch.equal(value, state[f"kept/{key.removeprefix('weights.')}"]) for key, value in last_good.items())
 
 
-def test_a_validation_that_is_no_number_ends_the_training(annotated_root: Path, out: Path) -> None:
+def test_a_non_finite_validation_loss_ends_the_training(annotated_root: Path, out: Path) -> None:
     network = changed(load_network("length"), nan_at(2), validation=True)
     with pytest.raises(BadInput, match="a validation loss of nan at step 2 of 50"):
         train(network, annotated_root, out, steps=50, validate_every=1)
 
 
-def test_at_the_first_step_the_clips_are_named_and_not_the_learning_rate(annotated_root: Path, out: Path) -> None:
+def test_at_the_first_step_the_error_points_to_the_clips(annotated_root: Path, out: Path) -> None:
     network = changed(load_network("length"), nan_at(1))
-    with pytest.raises(BadInput, match=r"step 1 of 50; look for clips.*nothing was kept"):
+    with pytest.raises(BadInput, match=r"step 1 of 50; look for clips.*no weights are saved"):
         train(network, annotated_root, out, steps=50)
 
 
-def test_a_learning_rate_that_is_far_too_high_is_found_without_help(annotated_root: Path, out: Path) -> None:
+def test_a_learning_rate_that_is_far_too_high_is_detected(annotated_root: Path, out: Path) -> None:
     with pytest.raises(BadInput, match=r"not finite|loss of (nan|inf).*learning_rate \(1e\+30\)"):
         train(load_network("length"), annotated_root, out, steps=50, learning_rate=1e30)
 
 
-def test_the_key_that_is_named_is_the_one_that_decides(tmp_path: Path) -> None:
+def test_the_error_states_the_key_that_takes_effect(tmp_path: Path) -> None:
     path = tmp_path / "params.yaml"
     train_section = (
         "{preset: ours, size: small, seed: 0, paper: {}, "
@@ -164,15 +164,15 @@ def test_the_key_that_is_named_is_the_one_that_decides(tmp_path: Path) -> None:
 def test_the_evaluator_stops_at_clips_with_numbers_that_are_not_finite(
     annotated_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, subset: str
 ) -> None:
-    """It went on for all its epochs, and kept the weights that it began with."""
+    """Otherwise it would run all epochs and return its initial weights."""
     of = Examples.of
 
-    def spoilt(annotated: AnnotatedStore, split: str) -> Examples:
-        found = of(annotated, split)
-        steps = [np.full_like(own, np.nan) if split == subset else own for own in found.steps]
-        return replace(found, steps=steps)
+    def corrupted(annotated: AnnotatedStore, split: str) -> Examples:
+        examples = of(annotated, split)
+        steps = [np.full_like(array, np.nan) if split == subset else array for array in examples.steps]
+        return replace(examples, steps=steps)
 
-    monkeypatch.setattr(Examples, "of", spoilt)
+    monkeypatch.setattr(Examples, "of", corrupted)
     kind = "training loss at step 1" if subset == "train" else "validation loss after step 1"
     with pytest.raises(BadInput, match=f"evaluator: expected finite losses, got a {kind} of nan"):
         train_evaluators(annotated_root, tmp_path / "out", EvaluatorSettings(("corrected",)))
@@ -195,6 +195,6 @@ def test_a_sampled_motion_that_is_not_finite_is_an_error_that_names_the_request(
     for weight in model.trained["diffusion"].network.parameters():
         weight.data.fill_(1e30)
     sample = HoiDataset(annotated, "test", crop="start")[0]
-    asked = requests_for(sample, PredictionConfig(samples=1))
+    requests = requests_for(sample, PredictionConfig(samples=1))
     with pytest.raises(BadInput, match=rf"motion {sample.clip_id}~0 \(.*\): expected finite numbers, got NaN or inf"):
-        model.sample(asked)
+        model.sample(requests)

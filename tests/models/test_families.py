@@ -22,12 +22,12 @@ from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
 from models.baselines.lookups import Lookup
 from models.common.family import Sources, motion_clip
-from models.common.predicting import AsksContact, PredictionConfig, requests_for, sample_family, spread
+from models.common.predicting import PredictionConfig, ReportsContact, requests_for, sample_family, spread
 from models.registry import family_names, load_family, load_network
 from models.text2hoi.contact_training import best_threshold, mean_f1
 from models.text2hoi.family import OtherPrompt, mean_map_by_position, other_prompts
-from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
-from models.text2hoi.sampler import AT_ONCE, Text2Hoi, Text2HoiMotion, alike
+from models.text2hoi.motion_representation import MotionRepresentation, MotionRepresentationConfig
+from models.text2hoi.sampler import MAX_BATCH_SIZE, Text2Hoi, Text2HoiMotion, bucket_by_length
 from models.text2hoi.verb_check import VerbCheck
 from tests.models.toy import FAST
 
@@ -162,8 +162,8 @@ def test_another_prompt_is_what_text2hoi_is_told(sources: Sources) -> None:
     other, family = other_prompts(sources)[request.clip_id], load_family("other-prompt").load(sources)
     assert isinstance(family, OtherPrompt)
     told = replace(request, sentence=Sentence(other.sentences[0], other.verb, other.object_words), text=other.text[0])
-    assert [own.sentence for own in family.told([request])] == [told.sentence]
-    np.testing.assert_array_equal(family.told([request])[0].text, told.text)
+    assert [own.sentence for own in family.with_other_sentences([request])] == [told.sentence]
+    np.testing.assert_array_equal(family.with_other_sentences([request])[0].text, told.text)
     (made,) = family.sample([request])
     own, expected = load_family("text2hoi").load(sources).sample([request, told])
     np.testing.assert_allclose(joints_of(made), joints_of(expected), atol=1e-5)
@@ -222,19 +222,19 @@ def test_a_hold_takes_the_refiners_place_where_told_or_where_hands_are_given_in_
 ) -> None:
     request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
     usual = load_family("text2hoi").load(sources)
-    told = {"text2hoi": {**FAST["text2hoi"], "refined_by": "hold"}}
+    told = {"text2hoi": {**FAST["text2hoi"], "refined_by": "contact_refinement"}}
     model = load_family("text2hoi").load(replace(sources, settings=told))
     assert isinstance(model, Text2Hoi)
     assert isinstance(usual, Text2Hoi)
-    assert (usual.refined_by, model.refined_by) == ("network", "hold")
+    assert (usual.refined_by, model.refined_by) == ("network", "contact_refinement")
     (motion,) = model.motions([request])
     assert torch.equal(motion.refined, motion.coarse)
     (before,), (held,) = (model.clips([request], [motion], refined=kind) for kind in (False, True))
     for side, track in hold_hands(HANDS, before).items():
         np.testing.assert_array_equal(held.hands[side].hand_pose, track.hand_pose)
-    in_object = MotionCode(MotionCodeConfig(4, hand_frame="object"))
-    monkeypatch.setattr(usual.trained["diffusion"].network, "code", in_object)
-    assert usual.refined_by == "hold"
+    in_object = MotionRepresentation(MotionRepresentationConfig(4, hand_frame="object"))
+    monkeypatch.setattr(usual.trained["diffusion"].network, "representation", in_object)
+    assert usual.refined_by == "contact_refinement"
 
 
 def test_requests_share_a_batch_with_those_of_the_same_hands_and_of_like_length(sources: Sources) -> None:
@@ -242,11 +242,11 @@ def test_requests_share_a_batch_with_those_of_the_same_hands_and_of_like_length(
     flags, draws = ((True, False), (False, True), (True, True)), np.random.default_rng(0)
     asked = [
         replace(request, active_hands=np.array(flags[draws.integers(3)]), n_frames=int(draws.integers(8, 151)))
-        for _ in range(4 * AT_ONCE)
+        for _ in range(4 * MAX_BATCH_SIZE)
     ]
-    batches = alike(asked)
+    batches = bucket_by_length(asked)
     assert sorted(number for own in batches for number in own) == list(range(len(asked)))
-    assert all(len(own) <= AT_ONCE and len({tuple(asked[n].active_hands) for n in own}) == 1 for own in batches)
+    assert all(len(own) <= MAX_BATCH_SIZE and len({tuple(asked[n].active_hands) for n in own}) == 1 for own in batches)
     lengths = [[asked[number].n_frames for number in own] for own in batches]
     assert all(own == sorted(own) for own in lengths)
     assert len(batches) <= 4 + len(flags)
@@ -270,7 +270,7 @@ def test_a_motion_whose_hands_cannot_carry_or_that_does_as_another_verb_says_is_
     sources: Sources, monkeypatch: pytest.MonkeyPatch, shares: tuple[float, ...], others: str, taken: int, draws: int
 ) -> None:
     request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
-    told = {"text2hoi": {**FAST["text2hoi"], "refined_by": "hold", "draws": 3}}
+    told = {"text2hoi": {**FAST["text2hoi"], "refined_by": "contact_refinement", "max_attempts": 3}}
     model = load_family("text2hoi").load(replace(sources, settings=told))
     assert isinstance(model, Text2Hoi)
     found, left, verbs = list[Clip](), list(shares), list(others)
@@ -285,7 +285,7 @@ def test_a_motion_whose_hands_cannot_carry_or_that_does_as_another_verb_says_is_
     monkeypatch.setattr(VerbCheck, "beyond", lambda self, asked, numbers: next(beyond))
     monkeypatch.setattr(VerbCheck, "fails", lambda self, request, moved_as: moved_as in "yb")
     (answer,) = model.answers([request])
-    assert (answer.draws, len(found), left) == (draws, draws, [])
+    assert (answer.attempts, len(found), left) == (draws, draws, [])
     assert (answer.carried, answer.clip, answer.moved_as) == (shares[taken], found[taken], others[taken])
     for one, other in pairwise(found):
         assert abs(joints_of(one) - joints_of(other)).max() > 1e-3
@@ -299,7 +299,7 @@ def test_only_a_hold_asks_whether_hands_carry_and_what_the_object_does(
     assert isinstance(model, Text2Hoi)
     monkeypatch.setattr("models.text2hoi.sampler.carried_share", None)
     monkeypatch.setattr("models.text2hoi.sampler.VerbCheck", None)
-    assert [answer.draws for answer in model.answers([request])] == [1]
+    assert [answer.attempts for answer in model.answers([request])] == [1]
 
 
 def test_sampling_writes_an_ordinary_store_and_the_familys_own_figures(
@@ -336,7 +336,7 @@ def test_the_contact_map_a_motion_was_drawn_for_is_told_by_families_that_draw_on
     told = [motion.contact_map.numpy() == 1 for motion in model.motions(requests, refined=False)]
     for family in ("text2hoi", "text2hoi-coarse"):
         sampler = load_family(family).load(sources)
-        assert isinstance(sampler, AsksContact)
+        assert isinstance(sampler, ReportsContact)
         np.testing.assert_array_equal(sampler.sample_asked(requests)[1], told)
     sample_family(load_family("nearest-clip"), annotated_root, trained, tmp_path / "a", {"samples": 1}, HANDS)
     assert read_asked(tmp_path / "a" / "clips") == {}

@@ -1,4 +1,4 @@
-"""Smoke tests on a GPU: every network trains a step there, and a motion is sampled. Skipped by name without one."""
+"""Smoke tests on a GPU: every network trains a step there, and a motion is sampled. Skipped without one."""
 
 from pathlib import Path
 
@@ -37,7 +37,7 @@ def test_every_network_trains_on_the_gpu_and_its_weights_are_finite(on_gpu: Path
 
 
 def test_same_seed_same_bytes_on_the_gpu(annotated_root: Path, tmp_path: Path) -> None:
-    """As a stage trains: with every operation in an order of its own."""
+    """With deterministic operations, as in a stage."""
     repeatable = [torch.are_deterministic_algorithms_enabled(), torch.get_num_threads()]
     make_repeatable(threads=1)
     try:
@@ -57,5 +57,5 @@ def test_motions_are_sampled_and_measured_on_the_gpu(annotated_root: Path, on_gp
     sample_family(
         family, annotated_root, on_gpu, tmp_path / "motions", {"samples": 2}, hands, settings=FAST, device="cuda"
     )
-    figures = evaluate_store(tmp_path / "motions" / "clips", annotated_root, hands)["figures"]
-    assert all(np.isfinite(value) for value in figures.values())
+    metrics = evaluate_store(tmp_path / "motions" / "clips", annotated_root, hands)["figures"]
+    assert all(np.isfinite(value) for value in metrics.values())

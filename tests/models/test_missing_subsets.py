@@ -21,10 +21,10 @@ from models.common.training import train_network
 from models.evaluator.settings import EvaluatorSettings
 from models.evaluator.stage import train_evaluators
 from models.registry import load_family, load_network
-from models.text2hoi.contact_training import contact_threshold, draw_threshold
-from models.text2hoi.family import contact_figures, other_prompts
+from models.text2hoi.contact_training import contact_threshold, sample_threshold
+from models.text2hoi.family import contact_metrics, other_prompts
 from tests.builders.stores import write_annotated
-from tests.models.conftest import PLANS, make_clip
+from tests.models.conftest import TOY_MOTIONS, make_clip
 from tests.models.test_progress import SETTINGS
 
 NO_VALIDATION = {"by": "subject", "train": ["s1"], "test": ["s3"], "promises": ["subject"]}
@@ -34,7 +34,7 @@ HANDS = load_embedded_hands()
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The toy dataset with its validation clips in no subset."""
-    clips = [make_clip(number, plan) for number, plan in enumerate(PLANS)]
+    clips = [make_clip(number, plan) for number, plan in enumerate(TOY_MOTIONS)]
     return write_annotated(tmp_path_factory.mktemp("no-validation"), clips, rule=NO_VALIDATION)
 
 
@@ -78,7 +78,7 @@ def test_thresholds_that_no_validation_clip_chooses_are_one_half(
     """Also those of the mean maps that the network is compared with: no training clip chooses for them."""
     train("contact", root, tmp_path / "contact")
     checkpoint = load_checkpoint(tmp_path / "contact", load_network("contact"))
-    assert (contact_threshold(checkpoint), draw_threshold(checkpoint)) == (0.5, 0.5)
+    assert (contact_threshold(checkpoint), sample_threshold(checkpoint)) == (0.5, 0.5)
     annotated = load_annotated(root)
     train_clips, test = (list(HoiDataset(annotated, subset, crop="start")) for subset in ("train", "test"))
 
@@ -87,7 +87,7 @@ def test_thresholds_that_no_validation_clip_chooses_are_one_half(
 
     monkeypatch.setattr("models.text2hoi.family.best_threshold", refuse)
     sources = Sources(annotated, tmp_path, HANDS, torch.device("cpu"))
-    assert contact_figures(sources, train_clips, [], test)["threshold"] == 0.5
+    assert contact_metrics(sources, train_clips, [], test)["threshold"] == 0.5
 
 
 def test_a_corpus_holds_out_no_training_clip(root: Path) -> None:
@@ -108,7 +108,7 @@ def test_the_evaluator_keeps_the_first_seed_and_says_nothing_of_validation(root:
 @pytest.mark.slow
 def test_validation_clips_of_unknown_labels_choose_nothing_either(tmp_path: Path) -> None:
     """Their loss was no number, and the weights that training began with were kept."""
-    plans = [replace(plan, verb="pour") if plan.subject == "s2" else plan for plan in PLANS]
+    plans = [replace(plan, verb="pour") if plan.subject == "s2" else plan for plan in TOY_MOTIONS]
     root = write_annotated(tmp_path / "data", [make_clip(number, plan) for number, plan in enumerate(plans)])
     settings = EvaluatorSettings(("corrected",), seeds=(3, 1), most_steps=4)
     info = train_evaluators(root, tmp_path / "out", settings)
@@ -123,7 +123,7 @@ def test_a_mean_without_a_training_clip_of_the_hand_is_left_out(
 ) -> None:
     """Only clips of the right hand train; the left one had no motion at all under the name of a mean."""
     rule = {"by": "prefix", "train": ["1"], "test": ["0"], "promises": []}
-    clips = [replace(make_clip(number, plan), sequence=str(number)) for number, plan in enumerate(PLANS)]
+    clips = [replace(make_clip(number, plan), sequence=str(number)) for number, plan in enumerate(TOY_MOTIONS)]
     store = load_annotated(write_annotated(tmp_path, clips, rule=rule))
     sample = HoiDataset(store, "test", crop="start")[0]
     sampler = load_family(family).load(Sources(store, tmp_path, HANDS, torch.device("cpu")))
@@ -135,7 +135,7 @@ def test_a_mean_without_a_training_clip_of_the_hand_is_left_out(
 
 def test_without_training_clips_there_is_no_nearest_window(tmp_path: Path) -> None:
     rule = {"by": "subject", "train": ["s9"], "test": ["s1"], "promises": []}
-    store = load_annotated(write_annotated(tmp_path, [make_clip(0, PLANS[0])], rule=rule))
+    store = load_annotated(write_annotated(tmp_path, [make_clip(0, TOY_MOTIONS[0])], rule=rule))
     sampler = load_family("nearest-window").load(Sources(store, tmp_path, HANDS, torch.device("cpu")))
     asked = requests_for(HoiDataset(store, "test", crop="start")[0], PredictionConfig(samples=1))
     assert [type(answer) for answer in sampler.sample(asked)] == [LeftOut]
@@ -143,7 +143,7 @@ def test_without_training_clips_there_is_no_nearest_window(tmp_path: Path) -> No
 
 def test_a_clip_whose_sentence_all_test_clips_have_gets_no_other_prompt(tmp_path: Path, trained: Path) -> None:
     """It was told its own, and counted as one that was told another."""
-    plans = [replace(PLANS[5]), replace(PLANS[0]), replace(PLANS[1])]
+    plans = [replace(TOY_MOTIONS[5]), replace(TOY_MOTIONS[0]), replace(TOY_MOTIONS[1])]
     store = load_annotated(write_annotated(tmp_path, [make_clip(number, plan) for number, plan in enumerate(plans)]))
     sources = Sources(store, trained, HANDS, torch.device("cpu"))
     assert other_prompts(sources) == {}
@@ -155,14 +155,19 @@ def test_a_clip_whose_sentence_all_test_clips_have_gets_no_other_prompt(tmp_path
 
 
 def test_bimart_is_told_another_object_only_where_there_is_one(tmp_path: Path) -> None:
-    plans = [PLANS[0], PLANS[1], PLANS[5], PLANS[2]]  # boxes, and a notebook that tests with the last box
+    plans = [
+        TOY_MOTIONS[0],
+        TOY_MOTIONS[1],
+        TOY_MOTIONS[5],
+        TOY_MOTIONS[2],
+    ]  # boxes, and a notebook that tests with the last box
     plans[3] = replace(plans[3], subject="s3")
     store = load_annotated(write_annotated(tmp_path, [make_clip(number, plan) for number, plan in enumerate(plans)]))
     asked = {
         sample.object_model.name: requests_for(sample, PredictionConfig(samples=1))[0]
         for sample in HoiDataset(store, "test", crop="start")
     }
-    box, notebook = asked[PLANS[0].model.name], asked[PLANS[2].model.name]
+    box, notebook = asked[TOY_MOTIONS[0].model.name], asked[TOY_MOTIONS[2].model.name]
     left_out = {
         change: [HandsForPaths(None, HANDS, None, True, change, store)._why_not(one) for one in (box, notebook)]  # type: ignore[arg-type]
         for change in ("other object", "other path", "none")

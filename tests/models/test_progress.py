@@ -1,4 +1,4 @@
-"""A training that was killed, shared or watched gives what an undisturbed one gives."""
+"""A training that was killed, distributed or observed gives the same result as an undisturbed one."""
 
 import json
 import multiprocessing
@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from hoidata.batches.dataset import HoiDataset
 from hoidata.errors import BadInput
 from hoidata.store.annotated import AnnotatedStore
-from models.common.corpus import Wanted, batches
+from models.common.corpus import BatchSpec, batches
 from models.common.family import Network, Setup
 from models.common.progress import Progress, State
 from models.common.team import Team, run_team
@@ -28,12 +28,12 @@ from models.registry import load_network
 from tests.models.toy import BUDGET, PARAMS
 
 STEPS, SAVED_EVERY = 8, 2
-# Beside the toy's, of which other tests train each.
+# The toy's networks, and ManipNet's.
 SETTINGS = PARAMS | {"manipnet": {"network": {"encoder": 8}, "training": BUDGET, "loss": {"steps_per_clip": 4}}}
 
 
 def train(name: str, root: Path, out: Path, *, progress: Path | None = None, die_at: int = 0, **training) -> None:
-    """A short training of one network with these settings beside the toy's; killed (-9) at the start of a step."""
+    """A short training of one network with these settings over the toy's; killed at the start of step ``die_at``."""
     params = {**SETTINGS[name], "training": {**SETTINGS[name]["training"], **training}}
     network = load_network(name)
     needed = {load_network(other): out.parent / "needed" / other for other in network.needs}
@@ -42,25 +42,25 @@ def train(name: str, root: Path, out: Path, *, progress: Path | None = None, die
 
 
 def mortal(network: Network, die_at: int) -> Network:
-    """The network with an objective that ends the process when asked for the losses of its ``die_at``-th step."""
+    """The network with an objective that kills the process in its ``die_at``-th step."""
 
     def objective(setup: Setup):
-        made, normaliser = network.objective(setup)
-        count, losses = iter(range(1, die_at + 1)), made.losses
+        inner, normaliser = network.objective(setup)
+        count, losses = iter(range(1, die_at + 1)), inner.losses
 
         def counted(batch, generator):
             if next(count) == die_at:
                 os.kill(os.getpid(), signal.SIGKILL)
             return losses(batch, generator)
 
-        setattr(made, "losses", counted)  # noqa: B010 (pyright knows losses as a method)
-        return made, normaliser
+        setattr(inner, "losses", counted)  # noqa: B010 (pyright knows losses as a method)
+        return inner, normaliser
 
     return replace(network, objective=objective)
 
 
-def killed(*given, **named) -> None:
-    process = multiprocessing.get_context("fork").Process(target=train, args=given, kwargs=named)
+def killed(*arguments, **options) -> None:
+    process = multiprocessing.get_context("fork").Process(target=train, args=arguments, kwargs=options)
     process.start()
     process.join()
     assert process.exitcode == -signal.SIGKILL
@@ -89,22 +89,22 @@ def test_a_training_killed_three_times_writes_the_bytes_of_an_undisturbed_one(
     for file in ("model.safetensors", "log.csv"):
         assert (out / "broken" / file).read_bytes() == (out / "whole" / file).read_bytes(), file
     assert not (out / "progress").exists()
-    assert ("goes on after step" in capfd.readouterr().err) == (done > 0)
+    assert ("resumes after step" in capfd.readouterr().err) == (done > 0)
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 @pytest.mark.parametrize("name", [pytest.param("contact", marks=pytest.mark.slow), "length"])
-def test_a_short_training_is_saved_by_time_and_goes_on_with_the_same_bytes(
+def test_a_short_training_is_saved_by_time_and_resumes_with_the_same_bytes(
     annotated_root: Path, out: Path, name: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
 ) -> None:
-    """Its steps are fewer than save_every; here each of them takes longer than the time between two saves."""
+    """Its steps are fewer than save_every, but each step takes longer than the time between two saves."""
     monkeypatch.setattr("models.common.progress.SAVE_AFTER_S", 0.0)
-    monkeypatch.setattr("models.common.progress.SAVE_SHARE", 0)
+    monkeypatch.setattr("models.common.progress.SAVE_INTERVAL_FACTOR", 0)
     settings = {"steps": STEPS, "validate_every": 3, "keep_best": True, "ema_decay": 0.9}
     train(name, annotated_root, out / "whole", **settings)
     killed(name, annotated_root, out / "broken", progress=out / "progress", die_at=6, **settings)
     train(name, annotated_root, out / "broken", progress=out / "progress", **settings)
-    assert "goes on after step 5" in capfd.readouterr().err
+    assert "resumes after step 5" in capfd.readouterr().err
     for file in ("model.safetensors", "log.csv"):
         assert (out / "broken" / file).read_bytes() == (out / "whole" / file).read_bytes(), file
 
@@ -124,20 +124,18 @@ def test_saving_takes_a_fiftieth_of_the_time_at_most(tmp_path: Path, monkeypatch
     monkeypatch.setattr(progress, "save", save)
     for step in range(1, 401):
         now[0], state.step = now[0] + 1, step
-        progress.keep(state, 1000)
+        progress.save_if_due(state, 1000)
     assert saved == [10, 163, 316]
 
 
-def test_the_losses_that_are_saved_and_looked_at_are_those_of_the_whole_team(
-    annotated: AnnotatedStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of two processes that compute the same, sums are twice one's: also between two validations, where one saves."""
+def test_logged_losses_are_those_of_the_whole_team(annotated: AnnotatedStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With two processes that compute the same, sums are doubled, also between two validations when one saves."""
 
     def twice(team: Team, tensors: Iterable[torch.Tensor]) -> None:
         for tensor in tensors:
             tensor *= 2
 
-    monkeypatch.setattr(Team, "add_up", twice)
+    monkeypatch.setattr(Team, "sum_over_team", twice)
     network = torch.nn.Linear(1, 1)
     objective = SimpleNamespace(losses=lambda batch, generator: {"total": network.weight.sum() * 0 + 3.0})
     state = State(network, network, torch.optim.AdamW(network.parameters()))
@@ -149,7 +147,7 @@ def test_the_losses_that_are_saved_and_looked_at_are_those_of_the_whole_team(
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_losses_are_readable_while_it_runs_and_a_state_of_other_settings_or_no_state_is_said(
+def test_losses_are_readable_during_training_and_an_unusable_state_is_reported(
     annotated_root: Path, out: Path, capfd: pytest.CaptureFixture
 ) -> None:
     settings = {"steps": STEPS, "save_every": SAVED_EVERY, "validate_every": 1}
@@ -160,25 +158,25 @@ def test_losses_are_readable_while_it_runs_and_a_state_of_other_settings_or_no_s
     with safe_open(out / "progress" / "state.safetensors", framework="pt") as stored:
         assert json.loads(stored.metadata()["hoidata"])["step"] == 2
     other = {**settings, "learning_rate": 0.5}
-    for spoil, said in ((None, "other settings, data or code"), (b"no state", "cannot be read")):
-        if spoil:
+    for broken_state, message in ((None, "other settings, data or code"), (b"no state", "cannot be read")):
+        if broken_state:
             killed("length", annotated_root, out / "new", progress=out / "progress", die_at=4, **settings)
-            (out / "progress" / "state.safetensors").write_bytes(spoil)
+            (out / "progress" / "state.safetensors").write_bytes(broken_state)
         train("length", annotated_root, out / "found", progress=out / "progress", **other)
         train("length", annotated_root, out / "expected", **other)
-        assert said in capfd.readouterr().err
+        assert message in capfd.readouterr().err
         assert (out / "found" / "log.csv").read_bytes() == (out / "expected" / "log.csv").read_bytes()
 
 
-def test_training_leaves_the_process_as_it_found_it(annotated_root: Path, tmp_path: Path) -> None:
+def test_training_restores_the_state_of_the_process(annotated_root: Path, tmp_path: Path) -> None:
     def settings() -> tuple:
         algorithms = torch.are_deterministic_algorithms_enabled()
         return torch.get_num_threads(), torch.get_float32_matmul_precision(), algorithms, torch.initial_seed()
 
-    before, drawn = settings(), torch.get_rng_state()
+    before, random_state = settings(), torch.get_rng_state()
     train("length", annotated_root, tmp_path / "out")
     assert settings() == before
-    assert torch.equal(torch.get_rng_state(), drawn)
+    assert torch.equal(torch.get_rng_state(), random_state)
 
 
 @pytest.mark.slow
@@ -195,24 +193,24 @@ def test_two_processes_give_the_weights_of_one_and_write_one_file(annotated_root
 
 
 def train_all(names: tuple[str, ...], root: Path, out: Path) -> None:
-    """20 steps of each network in two parts per batch; each process notes itself where it may write."""
+    """20 steps of each network with two micro-batches; each process that writes notes its rank."""
     torch.set_num_threads(1)
     for name in names:
         network = load_network(name)
         needed = {load_network(other): out.parent / "needed" / other for other in network.needs}
-        budget = {**PARAMS[name]["training"], "steps": 20, "parts": 2, "validate_every": 10}
+        budget = {**PARAMS[name]["training"], "steps": 20, "micro_batches": 2, "validate_every": 10}
         train_network(network, root, out / name, {**PARAMS[name], "training": budget}, needed=needed)
     if Team.joined().writes:
         (out / "written").write_text(str(Team.joined().rank))
 
 
-def test_parts_of_a_batch_are_its_clips(annotated: AnnotatedStore) -> None:
+def test_micro_batches_contain_the_clips_of_the_batch(annotated: AnnotatedStore) -> None:
     dataset = HoiDataset(annotated, "train")
-    whole, parted = (next(batches(dataset, 3, 0, Wanted(parts=range(of), of=of))) for of in (1, 2))
+    whole, parted = (next(batches(dataset, 3, 0, BatchSpec(parts=range(of), of=of))) for of in (1, 2))
     ids = [[sample.clip_id for sample in batch.samples] for _, batch in parted]
-    assert [sorted(own) for own in ids] == [sorted(set(own)) for own in ids]
+    assert [sorted(part_ids) for part_ids in ids] == [sorted(set(part_ids)) for part_ids in ids]
     assert sorted(chain.from_iterable(ids)) == sorted(sample.clip_id for sample in whole[0][1].samples)
-    alone = next(batches(dataset, 3, 0, Wanted(parts=[1], of=2)))
+    alone = next(batches(dataset, 3, 0, BatchSpec(parts=[1], of=2)))
     assert [sample.clip_id for sample in alone[0][1].samples] == ids[1]
 
 
@@ -229,7 +227,7 @@ def test_a_training_in_bfloat16_keeps_its_weights_in_float32_and_learns_nearly_t
     assert max(float((exact[name] - lower[name]).abs().max()) for name in weights) < 0.02
 
 
-def test_parts_that_processes_cannot_share_are_refused() -> None:
+def test_micro_batches_that_do_not_divide_over_processes_are_refused() -> None:
     with pytest.raises(BadInput, match="a multiple of the 2 processes, got 3"):
-        Team(0, 2).own_parts(3)
-    assert [list(Team(rank, 2).own_parts(4)) for rank in (0, 1)] == [[0, 2], [1, 3]]
+        Team(0, 2).own_micro_batches(3)
+    assert [list(Team(rank, 2).own_micro_batches(4)) for rank in (0, 1)] == [[0, 2], [1, 3]]

@@ -1,4 +1,4 @@
-"""Samplers against what is known in closed form, against diffusers' own, and what guidance and absent hands cost."""
+"""Samplers compared with closed forms and with diffusers; the cost of guidance and of absent hands."""
 
 from collections.abc import Callable
 from importlib import import_module
@@ -14,11 +14,11 @@ from hoidata.errors import BadInput
 from models.common import sampling
 from models.common.sampling import (
     SamplerConfig,
+    alpha_bar_values,
     alphas_cumprod,
     draw_motion,
     sample,
     sample_motion,
-    signal_shares,
     timesteps,
 )
 from models.common.transformer import TransformerConfig
@@ -28,39 +28,37 @@ MEANS, SPREADS = (0.0, 0.5, -2.0), (0.4, 0.8, 1.5)
 
 
 def gaussian_denoiser(mean: Tensor, spread: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
-    """E[x0 | x_t] of data N(mean, spread^2): what a denoiser of it would learn."""
-    shares = torch.tensor(signal_shares(), dtype=torch.float64)
+    """E[x0 | x_t] of data from N(mean, spread^2): the optimal denoiser."""
+    alpha_bars = torch.tensor(alpha_bar_values(), dtype=torch.float64)
 
     def denoise(x: Tensor, steps: Tensor) -> Tensor:
-        share = shares[steps][:, None]
-        gain = spread**2 * share.sqrt() / (share * spread**2 + 1 - share)
-        return mean + gain * (x - share.sqrt() * mean)
+        alpha_bar = alpha_bars[steps][:, None]
+        gain = spread**2 * alpha_bar.sqrt() / (alpha_bar * spread**2 + 1 - alpha_bar)
+        return mean + gain * (x - alpha_bar.sqrt() * mean)
 
     return denoise
 
 
-def moments(kind: Any, steps: int, rows: int = 40_000) -> tuple[Tensor, Tensor]:
-    """Mean and spread of what a sampler makes of the three Gaussians."""
+def moments(kind: Any, steps: int, count: int = 40_000) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of a sampler's output for the three Gaussians."""
     mean, spread = (torch.tensor(values, dtype=torch.float64) for values in (MEANS, SPREADS))
     generator = torch.Generator().manual_seed(0)
-    half = torch.randn(rows // 2, 3, generator=generator, dtype=torch.float64)
+    half = torch.randn(count // 2, 3, generator=generator, dtype=torch.float64)
     noise = torch.cat((half, -half)) / half.square().mean(0).sqrt()  # mean 0 and spread 1, exactly
-    found = sample(gaussian_denoiser(mean, spread), noise, SamplerConfig(kind, steps), generator)
-    return found.mean(0), found.std(0, correction=0)
+    samples = sample(gaussian_denoiser(mean, spread), noise, SamplerConfig(kind, steps), generator)
+    return samples.mean(0), samples.std(0, correction=0)
 
 
 def off(kind: Any, steps: int) -> float:
-    """Largest error of a moment, as a share of the spread."""
+    """Largest error of a moment, relative to the standard deviation."""
     mean, spread = moments(kind, steps)
-    wanted = torch.tensor(MEANS, dtype=torch.float64), torch.tensor(SPREADS, dtype=torch.float64)
-    return float(torch.maximum((mean - wanted[0]).abs() / wanted[1], (spread / wanted[1] - 1).abs()).max())
+    expected = torch.tensor(MEANS, dtype=torch.float64), torch.tensor(SPREADS, dtype=torch.float64)
+    return float(torch.maximum((mean - expected[0]).abs() / expected[1], (spread / expected[1] - 1).abs()).max())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "few", "many"), [("ddim", 10, 250), ("dpm++", 6, 60), ("ddpm", 20, 1000)])
-def test_moments_of_gaussians_are_met_within_3_percent_and_nearer_with_more_steps(
-    kind: str, few: int, many: int
-) -> None:
+def test_moments_of_gaussians_are_within_3_percent_and_closer_with_more_steps(kind: str, few: int, many: int) -> None:
     assert off(kind, many) < 0.03
     assert off(kind, many) < off(kind, few) / 2
 
@@ -70,18 +68,18 @@ def test_the_second_order_needs_fewer_steps_than_ddim() -> None:
 
 
 @pytest.mark.parametrize("kind", ["ddim", "dpm++", "ddpm"])
-def test_another_schedule_than_the_denoisers_misses_them(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+def test_another_schedule_than_the_denoisers_gives_other_moments(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     mean, spread = (torch.tensor(values, dtype=torch.float64) for values in (MEANS, SPREADS))
     denoise = gaussian_denoiser(mean, spread)
     linear = tuple(np.cumprod(1 - np.linspace(1e-4, 0.02, 1000)).tolist())
-    monkeypatch.setattr(sampling, "signal_shares", lambda: linear)
+    monkeypatch.setattr(sampling, "alpha_bar_values", lambda: linear)
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(20_000, 3, generator=generator, dtype=torch.float64)
-    found = sample(denoise, noise, SamplerConfig(kind, 50), generator)  # pyright: ignore[reportArgumentType]
-    assert float((found.std(0) / spread - 1).abs().max()) > 0.1
+    samples = sample(denoise, noise, SamplerConfig(kind, 50), generator)  # pyright: ignore[reportArgumentType]
+    assert float((samples.std(0) / spread - 1).abs().max()) > 0.1
 
 
-@pytest.mark.slow  # diffusers takes five seconds to import: only the worker that asks for it does
+@pytest.mark.slow  # importing diffusers takes five seconds
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 @pytest.mark.parametrize(
     ("kind", "scheduler", "more"),
@@ -108,8 +106,8 @@ def test_every_step_is_that_of_diffusers(kind: Any, scheduler: str, more: dict) 
     for step in theirs.timesteps:
         more_noise = {} if kind == "ddim" else {"generator": generators[0]}
         x = theirs.step(torch.tanh(x), step, x, return_dict=False, **more_noise)[0]
-    found = sample(lambda x, _: torch.tanh(x), noise, SamplerConfig(kind, 20), generators[1])
-    torch.testing.assert_close(found, x, atol=2e-3 if kind == "ddpm" else 1e-4, rtol=0)
+    samples = sample(lambda x, _: torch.tanh(x), noise, SamplerConfig(kind, 20), generators[1])
+    torch.testing.assert_close(samples, x, atol=2e-3 if kind == "ddpm" else 1e-4, rtol=0)
 
 
 def test_the_schedule_is_nichol_and_dhariwals_cosine() -> None:
@@ -119,28 +117,30 @@ def test_the_schedule_is_nichol_and_dhariwals_cosine() -> None:
     torch.testing.assert_close(alphas_cumprod().double(), (1 - betas).cumprod(0), atol=1e-6, rtol=1e-5)
 
 
-def test_a_perfect_denoiser_gives_the_clean_motion_back() -> None:
+def test_a_perfect_denoiser_returns_the_clean_motion() -> None:
     generator = torch.Generator().manual_seed(0)
     truth = torch.randn(3, 2, 7, 99, generator=generator), torch.randn(3, 7, 10, generator=generator)
     for kind, steps in (("ddim", 1), ("ddim", 20), ("dpm++", 8), ("ddpm", 50)):
         config = SamplerConfig(kind, steps)  # pyright: ignore[reportArgumentType]
         noise = draw_motion(truth[0].shape, truth[1].shape, generator)
-        for found, true in zip(sample_motion(lambda *_: truth, noise, config, generator), truth, strict=True):
-            torch.testing.assert_close(found, true, atol=1e-4, rtol=0)
+        for denoised, true in zip(sample_motion(lambda *_: truth, noise, config, generator), truth, strict=True):
+            torch.testing.assert_close(denoised, true, atol=1e-4, rtol=0)
 
 
-def test_a_row_with_a_generator_of_its_own_is_the_same_in_any_company() -> None:
+def test_a_sample_with_its_generator_does_not_depend_on_the_batch() -> None:
     denoise = gaussian_denoiser(torch.zeros(1), torch.ones(1))
     config, noise = SamplerConfig("ddpm", 20), torch.ones(3, 1, dtype=torch.float64)
     many = sample(denoise, noise, config, [torch.Generator().manual_seed(seed) for seed in (5, 6, 7)])
     alone = sample(denoise, noise[:1], config, [torch.Generator().manual_seed(7)])
     torch.testing.assert_close(many[2:], alone)
-    assert len({round(float(row), 6) for row in many}) == 3
+    assert len({round(float(value), 6) for value in many}) == 3
 
 
 def small_model() -> DiffusionModel:
     torch.manual_seed(0)
-    return DiffusionModel(DiffusionConfig(TransformerConfig(32, 2, 2, 64, 0.0))).eval()
+    return DiffusionModel(
+        DiffusionConfig(TransformerConfig(width=32, layers=2, heads=2, feed_forward=64, dropout=0.0))
+    ).eval()
 
 
 def condition_of(batch: ClipBatch, model: DiffusionModel) -> Condition:
@@ -151,28 +151,28 @@ def condition_of(batch: ClipBatch, model: DiffusionModel) -> Condition:
 def test_guidance_is_one_call_of_twice_the_batch_and_the_condition_is_computed_once(
     batch: ClipBatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, sizes, prepared = small_model(), [], []
-    condition, prepare = condition_of(batch, model), model.prepare
-    model.encoder.register_forward_pre_hook(lambda _, given: sizes.append(len(given[0])))
-    monkeypatch.setattr(model, "prepare", lambda given: prepared.append(given) or prepare(given))
+    model, sizes, encoded = small_model(), [], []
+    condition, encode = condition_of(batch, model), model.encode_condition
+    model.encoder.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0])))
+    monkeypatch.setattr(model, "encode_condition", lambda value: encoded.append(value) or encode(value))
     denoise, steps = guided(model, condition, 2.5), torch.full((3,), 400)
     for _ in range(4):
-        found = denoise(batch.hands, batch.object, steps)
-    assert (sizes, len(prepared)) == ([6] * 4, 1)
-    told = model(batch.hands, batch.object, steps, condition)
-    untold = model(batch.hands, batch.object, steps, condition, torch.tensor([[0.0, 1.0, 1.0]]).expand(3, -1))
-    for own, with_text, without in zip(found, told, untold, strict=True):
-        torch.testing.assert_close(own, without + 2.5 * (with_text - without), atol=1e-5, rtol=1e-4)
+        outputs = denoise(batch.hands, batch.object, steps)
+    assert (sizes, len(encoded)) == ([6] * 4, 1)
+    conditioned = model(batch.hands, batch.object, steps, condition)
+    unconditioned = model(batch.hands, batch.object, steps, condition, torch.tensor([[0.0, 1.0, 1.0]]).expand(3, -1))
+    for output, with_text, without in zip(outputs, conditioned, unconditioned, strict=True):
+        torch.testing.assert_close(output, without + 2.5 * (with_text - without), atol=1e-5, rtol=1e-4)
 
 
 @torch.no_grad()
-def test_hands_that_take_no_part_and_padding_are_cut_not_masked(batch: ClipBatch) -> None:
-    """One hand, F frames: a condition and F tokens of the hand and of the object each."""
+def test_inactive_hands_and_padding_are_cut_instead_of_masked(batch: ClipBatch) -> None:
+    """One hand, F frames: one condition token and F tokens each of the hand and the object."""
     model, tokens = small_model(), []
-    model.encoder.register_forward_pre_hook(lambda _, given: tokens.append(given[0].shape[1]))
+    model.encoder.register_forward_pre_hook(lambda _, inputs: tokens.append(inputs[0].shape[1]))
     alone, both = collate([batch.samples[0]]), collate(batch.samples[2:])
-    for own in (alone, both):
-        model(own.hands, own.object, torch.zeros(1, dtype=torch.long), condition_of(own, model))
+    for clips in (alone, both):
+        model(clips.hands, clips.object, torch.zeros(1, dtype=torch.long), condition_of(clips, model))
     assert tokens == [1 + 2 * alone.counts[0], 1 + 3 * both.counts[0]]
     hands, _ = model(alone.hands, alone.object, torch.zeros(1, dtype=torch.long), condition_of(alone, model))
     assert not hands[:, 1].any()
@@ -181,6 +181,6 @@ def test_hands_that_take_no_part_and_padding_are_cut_not_masked(batch: ClipBatch
 @pytest.mark.parametrize(
     "wrong", [{"steps": 0}, {"steps": 1001}, {"guidance": float("nan")}, {"guidance": float("inf")}]
 )
-def test_steps_and_a_guidance_that_do_not_exist_are_refused(wrong: dict) -> None:
+def test_steps_and_guidance_out_of_range_are_refused(wrong: dict) -> None:
     with pytest.raises(BadInput, match="1 to 1000 steps, a finite guidance"):
         sampling.SamplerConfig(**wrong)

@@ -1,4 +1,4 @@
-"""Processes that train one network together end with the process that started them, and tell errors in words."""
+"""The processes of a team end with the process that started them, and pass errors on to it."""
 
 import os
 import signal
@@ -40,7 +40,7 @@ def is_alive(pid: int) -> bool:
 
 
 @pytest.mark.slow
-def test_no_process_of_a_team_outlives_the_one_that_started_it(tmp_path: Path) -> None:
+def test_no_process_of_a_team_outlives_its_parent(tmp_path: Path) -> None:
     command, root = [sys.executable, "-c", PARENT, str(tmp_path)], Path(__file__).parents[2]
     parent = subprocess.Popen(command, cwd=root, env={**os.environ, "PYTHONPATH": str(root)})
     notes = [tmp_path / f"pid-{rank}" for rank in range(2)]
@@ -60,7 +60,7 @@ def test_no_process_of_a_team_outlives_the_one_that_started_it(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_an_error_in_words_of_a_team_is_raised_as_it_is(tmp_path: Path) -> None:
+def test_an_error_in_a_team_is_raised_unchanged(tmp_path: Path) -> None:
     with pytest.raises(BadInput) as raised:
         run_team(refuse, 2, tmp_path / "meeting")
     assert str(raised.value) == "training of length: expected finite losses and weights, got nan by 2; lower it"

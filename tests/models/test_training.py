@@ -1,4 +1,4 @@
-"""Training and generation on the toy dataset, and what their files promise."""
+"""Training and generation on the toy dataset, and the contents of their files."""
 
 import hashlib
 import json
@@ -45,7 +45,7 @@ def test_training_twice_gives_the_same_bytes(annotated_root: Path, trained: Path
         assert (tmp_path / name / "log.csv").read_bytes() == (trained / name / "log.csv").read_bytes()
 
 
-def test_a_checkpoint_has_one_metadata_key_and_says_what_it_was_trained_on(trained: Path) -> None:
+def test_a_checkpoint_has_one_metadata_key_with_facts_about_its_training(trained: Path) -> None:
     for name in PARAMS:
         with safe_open(trained / name / "model.safetensors", framework="pt") as stored:
             assert list(stored.metadata()) == ["hoidata"]
@@ -69,10 +69,10 @@ def test_saving_what_was_loaded_gives_the_same_bytes_every_time(trained: Path, t
 
 
 def test_the_log_has_training_and_validation_losses(trained: Path) -> None:
-    header, *rows = (trained / "diffusion" / "log.csv").read_text().splitlines()
+    header, *lines = (trained / "diffusion" / "log.csv").read_text().splitlines()
     expected = "step,validation,train_total,train_simple,train_distance_map,train_relative_orientation"
     assert header == expected
-    assert [row.split(",")[0] for row in rows] == ["1", "2"]
+    assert [line.split(",")[0] for line in lines] == ["1", "2"]
 
 
 def test_a_wrong_or_missing_checkpoint_is_named(trained: Path, tmp_path: Path) -> None:
@@ -86,20 +86,18 @@ def test_a_wrong_or_missing_checkpoint_is_named(trained: Path, tmp_path: Path) -
         load_checkpoint(tmp_path, load_network("contact"))
 
 
-def test_a_trained_network_knows_the_objects_it_was_trained_on_and_no_other(
-    trained: Path, annotated: AnnotatedStore
-) -> None:
+def test_a_trained_network_recognises_only_its_training_objects(trained: Path, annotated: AnnotatedStore) -> None:
     network = load_checkpoint(trained / "diffusion", load_network("diffusion")).network
     assert isinstance(network, DiffusionModel)
     points = {sample.object_key: sample.points.points_m for sample in Corpus.of(annotated, 0).train}
     summary = network.object_feature(torch.from_numpy(np.stack(list(points.values()))))
     assert len(points) == 2
-    assert network._known(summary).tolist() == [[1], [1]]
+    assert network._is_training_object(summary).tolist() == [[1], [1]]
     longer = torch.from_numpy(points.popitem()[1]) * torch.tensor([1.0, 1.0, 1.5])
-    assert network._known(network.object_feature(longer[None])).tolist() == [[0]]
+    assert network._is_training_object(network.object_feature(longer[None])).tolist() == [[0]]
 
 
-def test_a_checkpoint_with_a_setting_that_is_gone_says_to_train_it_again(trained: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_with_an_unknown_setting_must_be_trained_again(trained: Path, tmp_path: Path) -> None:
     stored = load_checkpoint(trained / "contact", load_network("contact"))
     stored.info["config"]["network_of_old"] = True
     with pytest.raises(BadInput, match=r"network_of_old.*again with this version"):
@@ -118,7 +116,7 @@ def test_unknown_settings_are_refused_with_the_known_ones(annotated_root: Path, 
         train_network(diffusion, annotated_root, tmp_path, {})
 
 
-def test_nothing_to_train_on_gives_a_note_with_the_reason(trained: Path, tmp_path: Path) -> None:
+def test_without_clips_the_reason_is_written(trained: Path, tmp_path: Path) -> None:
     root, out = tmp_path / "data", tmp_path / "out"
     (root / "clips").mkdir(parents=True)
     (root / "clips" / "empty.json").write_text('{"reason":"grab is not present"}')
@@ -127,8 +125,8 @@ def test_nothing_to_train_on_gives_a_note_with_the_reason(trained: Path, tmp_pat
 
 
 def user_box() -> ObjectModel:
-    made = trimesh.creation.box((0.05, 0.08, 0.1))
-    return ObjectModel("my box", made.vertices, made.faces, np.zeros(8, np.uint8))
+    mesh = trimesh.creation.box((0.05, 0.08, 0.1))
+    return ObjectModel("my box", mesh.vertices, mesh.faces, np.zeros(8, np.uint8))
 
 
 def motion(trained: Path, text: str, seed: int) -> GeneratedMotion:
@@ -139,56 +137,62 @@ def generator(trained: Path) -> Generator:
     return Generator.load(trained, load_embedded_hands(), load_encoder("hash"))
 
 
-def bytes_of(made: GeneratedMotion) -> bytes:
-    arrays = [made.contact, made.clip.object.rotvec, made.clip.object.translation_m]
-    for track in made.clip.hands.values():
+def bytes_of(motion: GeneratedMotion) -> bytes:
+    arrays = [motion.contact, motion.clip.object.rotvec, motion.clip.object.translation_m]
+    for track in motion.clip.hands.values():
         arrays += [track.wrist_m, track.global_orient, track.hand_pose, track.betas, track.valid]
     return b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
 
 
 @pytest.mark.slow
-def test_generation_repeats_its_bytes_and_uses_only_the_hands_asked_for(trained: Path) -> None:
-    made = motion(trained, "Lift a box with the right hand.", 3)
-    assert bytes_of(made) == bytes_of(motion(trained, "Lift a box with the right hand.", 3))
-    assert bytes_of(made) != bytes_of(motion(trained, "Lift a box with the right hand.", 4))
-    assert made.clip.hands["right"].valid.all()
-    assert not made.clip.hands["left"].valid.any()
-    assert made.clip.dataset == "generated"
-    assert made.clip.synthetic
-    assert made.evidence["hand"]["source"] == "rule"
+def test_generation_is_reproducible_and_uses_only_the_requested_hands(trained: Path) -> None:
+    generated = motion(trained, "Lift a box with the right hand.", 3)
+    assert bytes_of(generated) == bytes_of(motion(trained, "Lift a box with the right hand.", 3))
+    assert bytes_of(generated) != bytes_of(motion(trained, "Lift a box with the right hand.", 4))
+    assert generated.clip.hands["right"].valid.all()
+    assert not generated.clip.hands["left"].valid.any()
+    assert generated.clip.dataset == "generated"
+    assert generated.clip.synthetic
+    assert generated.evidence["hand"]["source"] == "rule"
 
 
 @pytest.mark.slow
-def test_a_sample_is_the_same_however_many_are_asked_for_and_lengths_are_drawn_anew(trained: Path) -> None:
+def test_a_sample_does_not_depend_on_their_number_and_lengths_are_sampled(trained: Path) -> None:
     model, text = generator(trained), "Lift a box with the right hand."
     many = model.generate(text, user_box(), Wish(samples=6))
     assert bytes_of(many[0]) == bytes_of(model.generate(text, user_box())[0])
-    assert len({bytes_of(made) for made in many}) == 6
-    assert len({made.clip.n_frames for made in many}) > 1
-    assert {made.clip.n_frames for made in model.generate(text, user_box(), Wish(samples=2, frames=20))} == {20}
+    assert len({bytes_of(generated) for generated in many}) == 6
+    assert len({generated.clip.n_frames for generated in many}) > 1
+    assert {generated.clip.n_frames for generated in model.generate(text, user_box(), Wish(samples=2, frames=20))} == {
+        20
+    }
 
 
-def test_what_is_asked_for_beside_the_sentence_counts_before_its_words(trained: Path) -> None:
-    made = generator(trained).generate("Lift a box with the right hand.", user_box(), Wish(hand="left", frames=9))[0]
-    assert made.clip.hands["left"].valid.all()
-    assert not made.clip.hands["right"].valid.any()
+def test_options_take_precedence_over_the_sentence(trained: Path) -> None:
+    generated = generator(trained).generate("Lift a box with the right hand.", user_box(), Wish(hand="left", frames=9))[
+        0
+    ]
+    assert generated.clip.hands["left"].valid.all()
+    assert not generated.clip.hands["right"].valid.any()
     with pytest.raises(BadInput, match="8 to 150 frames"):
         generator(trained).generate("Lift a box.", user_box(), Wish(frames=151))
 
 
-def test_motions_are_made_as_the_models_say_but_for_what_is_told(
+def test_generation_uses_the_models_settings_except_for_given_options(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
-    given, load = dict[str, Any](), Generator.load
-    monkeypatch.setattr(Generator, "load", lambda *where, **options: given.update(options) or load(*where, **options))
-    sampling = SamplingConfig(SamplerConfig("dpm++", 3), draws=1)
+    options, load = dict[str, Any](), Generator.load
+    monkeypatch.setattr(Generator, "load", lambda *arguments, **more: options.update(more) or load(*arguments, **more))
+    sampling = SamplingConfig(SamplerConfig("dpm++", 3), max_attempts=1)
     models = Models(trained, load_embedded_hands(), load_encoder("hash"), sampling=sampling, points=256)
-    asked = Asked("Lift a box.", tmp_path / "box.stl", models=models, wish=Wish(frames=8), sampler={"steps": 2})
-    generate_files(asked, tmp_path / "out")
-    assert given == {"sampling": replace(sampling, sampler=SamplerConfig("dpm++", 2)), "points": 256}
-    made = load(trained, models.hands, models.encoder, **given).generate("Lift a box.", user_box(), Wish(frames=8))[0]
-    assert made.contact.shape == (256,)
+    request = Asked("Lift a box.", tmp_path / "box.stl", models=models, wish=Wish(frames=8), sampler={"steps": 2})
+    generate_files(request, tmp_path / "out")
+    assert options == {"sampling": replace(sampling, sampler=SamplerConfig("dpm++", 2)), "points": 256}
+    generated = load(trained, models.hands, models.encoder, **options).generate(
+        "Lift a box.", user_box(), Wish(frames=8)
+    )[0]
+    assert generated.contact.shape == (256,)
 
 
 def test_a_mesh_file_whose_name_is_no_text_is_read_and_its_name_stays_legible(trained: Path, tmp_path: Path) -> None:
@@ -204,19 +208,19 @@ def test_a_mesh_file_whose_name_is_no_text_is_read_and_its_name_stays_legible(tr
 @pytest.mark.parametrize(
     ("refined_by", "frames", "used"),
     [
-        ("hold", None, {"contact", "diffusion", "length"}),
-        ("hold", 8, {"contact", "diffusion"}),
+        ("contact_refinement", None, {"contact", "diffusion", "length"}),
+        ("contact_refinement", 8, {"contact", "diffusion"}),
         ("network", 8, {"contact", "diffusion", "refiner"}),
     ],
 )
-def test_a_motion_names_the_networks_that_had_a_part_in_it_and_no_other(
+def test_a_motion_lists_exactly_the_networks_that_generated_it(
     trained: Path, tmp_path: Path, refined_by: Any, frames: int | None, used: set[str]
 ) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
-    sampling = SamplingConfig(refined_by=refined_by, draws=1)
+    sampling = SamplingConfig(refined_by=refined_by, max_attempts=1)
     models = Models(trained, load_embedded_hands(), load_encoder("hash"), sampling=sampling)
-    asked = Asked("Lift a box.", tmp_path / "box.stl", models=models, wish=Wish(frames=frames))
-    generate_files(asked, tmp_path / "out")
+    request = Asked("Lift a box.", tmp_path / "box.stl", models=models, wish=Wish(frames=frames))
+    generate_files(request, tmp_path / "out")
     named = json.loads(str(np.load(tmp_path / "out" / "motion.npz")["checkpoints"]))
     files = {name: trained / name / "model.safetensors" for name in PARAMS}
     digests = {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}
@@ -225,49 +229,49 @@ def test_a_motion_names_the_networks_that_had_a_part_in_it_and_no_other(
     assert {name for name, digest in digests.items() if f"{name} {digest[:12]}" in page} == used
 
 
-def test_what_training_never_had_is_said(trained: Path) -> None:
-    said = generator(trained).generate("Juggle three oranges with both hands.", user_box(), Wish(frames=8))[0]
-    assert "the verb 'juggle' was never in training" in said.evidence["unseen"][0]
-    verb, likely = said.evidence["read_as"]
+def test_unseen_words_are_reported(trained: Path) -> None:
+    generated = generator(trained).generate("Juggle three oranges with both hands.", user_box(), Wish(frames=8))[0]
+    assert "the verb 'juggle' was never in training" in generated.evidence["unseen"][0]
+    verb, probability = generated.evidence["read_as"]
     assert verb in ("lift", "open", "pass")
-    assert 1 / 3 <= likely <= 1
+    assert 1 / 3 <= probability <= 1
 
 
-def test_the_verb_a_sentence_is_taken_for_is_its_own_where_training_had_it(trained: Path) -> None:
-    asked = {"lift": "Lift a box with the left hand.", "pass": "Pass a box with the right hand."}
-    for verb, text in asked.items():
-        said = generator(trained).generate(text, user_box(), Wish(frames=8))[0]
-        assert said.evidence["read_as"][0] == verb
+def test_training_verbs_are_classified_correctly(trained: Path) -> None:
+    sentences = {"lift": "Lift a box with the left hand.", "pass": "Pass a box with the right hand."}
+    for verb, text in sentences.items():
+        generated = generator(trained).generate(text, user_box(), Wish(frames=8))[0]
+        assert generated.evidence["read_as"][0] == verb
 
 
-def test_a_person_is_told_when_a_sentence_is_taken_for_another_verb(trained: Path, tmp_path: Path) -> None:
+def test_a_sentence_classified_as_another_verb_is_reported(trained: Path, tmp_path: Path) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
     models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), Wish(frames=8)
-    found = {}
+    notes = {}
     for text in ("Lift a box with the left hand.", "Juggle a box with both hands."):
-        asked = Asked(text, tmp_path / "box.stl", models=models, wish=wish, force=True)
-        found[text] = [note for note in generate_files(asked, tmp_path / "out").notes if "taken for '" in note]
-    assert [len(notes) for notes in found.values()] == [0, 1]
+        request = Asked(text, tmp_path / "box.stl", models=models, wish=wish, force=True)
+        notes[text] = [note for note in generate_files(request, tmp_path / "out").notes if "taken for '" in note]
+    assert [len(own_notes) for own_notes in notes.values()] == [0, 1]
     page = (tmp_path / "out" / "index.html").read_text()
-    read_as = found["Juggle a box with both hands."][0].split("'")[1]
+    read_as = notes["Juggle a box with both hands."][0].split("'")[1]
     assert f"{read_as} (" in page
 
 
-def test_a_person_is_told_that_a_second_action_is_not_made(trained: Path, tmp_path: Path) -> None:
+def test_a_second_action_of_a_sentence_is_reported_as_missing(trained: Path, tmp_path: Path) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
     models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), Wish(frames=8)
-    asked = Asked("Lift a box and pass it with the left hand.", tmp_path / "box.stl", models=models, wish=wish)
-    told = "a motion is one action: of 'lift', not of 'pass'; ask for each alone"
-    assert told in generate_files(asked, tmp_path / "out").notes
+    request = Asked("Lift a box and pass it with the left hand.", tmp_path / "box.stl", models=models, wish=wish)
+    note = "a motion is one action: of 'lift', not of 'pass'; ask for each alone"
+    assert note in generate_files(request, tmp_path / "out").notes
 
 
-def test_a_word_that_would_be_guessed_stops_the_command_unless_it_is_forced(trained: Path, tmp_path: Path) -> None:
+def test_an_unknown_word_is_refused_unless_forced(trained: Path, tmp_path: Path) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
     models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), Wish(frames=8)
 
     def notes(text: str, force: bool = False) -> list[str]:
-        asked = Asked(text, tmp_path / "box.stl", models=models, wish=wish, force=force)
-        return generate_files(asked, tmp_path / "out").notes
+        request = Asked(text, tmp_path / "box.stl", models=models, wish=wish, force=force)
+        return generate_files(request, tmp_path / "out").notes
 
     for text in ("Throw the ball with the left hand.", "Juggle a box with both hands."):
         with pytest.raises(
@@ -281,56 +285,56 @@ def test_a_word_that_would_be_guessed_stops_the_command_unless_it_is_forced(trai
     assert any("taken for '" in note for note in notes("Throw the ball with the left hand.", force=True))
 
 
-def test_a_hand_that_the_sentence_does_not_name_is_said(trained: Path, tmp_path: Path) -> None:
+def test_a_hand_that_the_sentence_does_not_name_is_reported(trained: Path, tmp_path: Path) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
     models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), Wish(frames=8)
-    asked = {
+    requests = {
         text: Asked(text, tmp_path / "box.stl", models=models, wish=wish)
         for text in ("Lift it.", "Lift it with the left hand.")
     }
-    said = {
-        text: [own for own in generate_files(one, tmp_path / "out").notes if "hand:" in own]
-        for text, one in asked.items()
+    notes = {
+        text: [note for note in generate_files(request, tmp_path / "out").notes if "hand:" in note]
+        for text, request in requests.items()
     }
-    assert said["Lift it with the left hand."] == []
-    assert said["Lift it."] == [
+    assert notes["Lift it with the left hand."] == []
+    assert notes["Lift it."] == [
         "hand: left, since no hand is named; left in 33% of the training clips (--hand chooses another)"
     ]
 
 
-def test_a_mesh_without_an_inside_and_one_that_was_repaired_are_said(trained: Path, tmp_path: Path) -> None:
+def test_an_open_mesh_and_a_repaired_one_are_reported(trained: Path, tmp_path: Path) -> None:
     models, box = Models(trained, load_embedded_hands(), load_encoder("hash")), trimesh.creation.box((0.05, 0.08, 0.1))
     inside_out = trimesh.Trimesh(box.vertices, box.faces[:, ::-1], process=False)
     meshes = {"open": trimesh.Trimesh(box.vertices, box.faces[:-2], process=False), "turned": inside_out, "whole": box}
-    said = {}
+    notes = {}
     for name, mesh in meshes.items():
         mesh.export(tmp_path / f"{name}.obj")
-        asked = Asked("Lift a box with the left hand.", tmp_path / f"{name}.obj", models=models, wish=Wish(frames=8))
-        said[name] = [note for note in generate_files(asked, tmp_path / "out").notes if note.startswith("mesh: ")]
-    assert said == {
+        request = Asked("Lift a box with the left hand.", tmp_path / f"{name}.obj", models=models, wish=Wish(frames=8))
+        notes[name] = [note for note in generate_files(request, tmp_path / "out").notes if note.startswith("mesh: ")]
+    assert notes == {
         "open": ["mesh: open has no inside: it is open; hands are drawn to its surface, not kept out of it"],
         "turned": ["mesh: turned: triangles turned outward"],
         "whole": [],
     }
 
 
-def test_a_person_is_told_of_differences_that_can_be_seen_and_the_page_has_the_others(
+def test_visible_differences_are_reported_and_the_page_has_the_others(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
     models = Models(trained, load_embedded_hands(), load_encoder("hash"))
-    asked = Asked("Lift a box with the left hand.", tmp_path / "box.stl", models=models, wish=Wish(frames=8))
-    monkeypatch.setattr(Text2Hoi, "refined_by", "hold")
+    request = Asked("Lift a box with the left hand.", tmp_path / "box.stl", models=models, wish=Wish(frames=8))
+    monkeypatch.setattr(Text2Hoi, "refined_by", "contact_refinement")
     monkeypatch.setattr("models.text2hoi.generation._contact_faults", lambda *_: [])
     monkeypatch.setattr("models.text2hoi.generation._is_still", lambda *_: False)
-    monkeypatch.setattr(VerbCheck, "unusual", lambda self, asked, numbers: ("rise_m 9 (usual: 0 to 1)", "path_m 8"))
+    monkeypatch.setattr(VerbCheck, "unusual", lambda self, request, numbers: ("rise_m 9 (usual: 0 to 1)", "path_m 8"))
     notes = {}
     for verb in ("lift", "open"):
         monkeypatch.setattr(VerbCheck, "moved_as", lambda self, numbers, verb=verb: verb)
-        for seen in ((), ("rise_m 9 (usual: 0 to 1)",)):
-            monkeypatch.setattr(VerbCheck, "seen", lambda self, asked, numbers, seen=seen: seen)
-            said = generate_files(asked, tmp_path / verb).notes
-            notes[verb, len(seen)] = [note for note in said if note.startswith("sample 1")]
+        for visible in ((), ("rise_m 9 (usual: 0 to 1)",)):
+            monkeypatch.setattr(VerbCheck, "seen", lambda self, request, numbers, visible=visible: visible)
+            all_notes = generate_files(request, tmp_path / verb).notes
+            notes[verb, len(visible)] = [note for note in all_notes if note.startswith("sample 1")]
     assert notes == {
         ("lift", 0): [],
         ("lift", 1): ["sample 1: unlike 'lift' in training: rise_m 9 (usual: 0 to 1)"],
@@ -343,23 +347,23 @@ def test_a_person_is_told_of_differences_that_can_be_seen_and_the_page_has_the_o
 
 
 def test_a_generated_clip_is_finite_and_starts_with_the_object_at_the_origin(trained: Path) -> None:
-    made = motion(trained, "Pass a box with both hands.", 0)
-    np.testing.assert_array_equal(made.clip.object.translation_m[0], 0)
-    np.testing.assert_array_equal(made.clip.gravity, [0, 0, -1])
-    for side, track in made.clip.hands.items():
+    generated = motion(trained, "Pass a box with both hands.", 0)
+    np.testing.assert_array_equal(generated.clip.object.translation_m[0], 0)
+    np.testing.assert_array_equal(generated.clip.gravity, [0, 0, -1])
+    for side, track in generated.clip.hands.items():
         assert track.valid.all()
         assert np.isfinite(track_joints(track, load_embedded_hands()[side])).all()
-    assert made.contact.shape == (1024,)
-    assert len(made.clip.source_frames) == made.evidence["frames"] >= 8
+    assert generated.contact.shape == (1024,)
+    assert len(generated.clip.source_frames) == generated.evidence["frames"] >= 8
 
 
-@pytest.mark.parametrize("name", ["steps", "batch", "validate_every", "parts", "save_every"])
-def test_a_budget_of_nothing_is_refused(name: str) -> None:
+@pytest.mark.parametrize("name", ["steps", "batch", "validate_every", "micro_batches", "save_every"])
+def test_a_budget_of_zero_is_refused(name: str) -> None:
     with pytest.raises(BadInput, match=f"training.{name}: expected 1 or more"):
         TrainingConfig(**{name: 0})
 
 
-def test_fewer_augmented_copies_than_none_are_refused() -> None:
+def test_a_negative_number_of_augmented_copies_is_refused() -> None:
     with pytest.raises(BadInput, match="augmented_copies: expected 0 or more, got -1"):
         TrainingConfig(augmented_copies=-1)
 
@@ -374,11 +378,11 @@ def test_generation_refuses_other_hands_and_encoders(trained: Path) -> None:
         Generator.load(trained, pair, encoder)
 
 
-def test_hands_and_encoder_that_are_not_given_are_those_of_the_networks(trained: Path) -> None:
-    wish, found = Wish(frames=8), []
+def test_hands_and_encoder_default_to_those_of_the_networks(trained: Path) -> None:
+    wish, tracks = Wish(frames=8), []
     for loaded in (Generator.load(trained), generator(trained)):
-        found.append(loaded.generate("Lift a box with the left hand.", user_box(), wish)[0].clip.hands["left"])
-    np.testing.assert_array_equal(found[0].wrist_m, found[1].wrist_m)
+        tracks.append(loaded.generate("Lift a box with the left hand.", user_box(), wish)[0].clip.hands["left"])
+    np.testing.assert_array_equal(tracks[0].wrist_m, tracks[1].wrist_m)
 
 
 class Downhill:
@@ -397,25 +401,25 @@ class Downhill:
 
 
 @pytest.mark.parametrize(("warmup", "expected"), [(0, (1.99, 1.971)), (1, (1.9, 1.89)), (2, (1.95, 1.85))])
-def test_kept_weights_are_a_running_average_from_the_end_of_the_warm_up_on(
+def test_the_resulting_weights_are_a_running_average_after_the_warm_up(
     annotated: AnnotatedStore, warmup: int, expected: tuple[float, float]
 ) -> None:
-    """Weights 2, 1.9, 1.8: 0.9 x 2 + 0.1 x 1.9 is 1.99, 0.9 x 1.99 + 0.1 x 1.8 is 1.971; until then they are kept."""
+    """Weights 2, 1.9, 1.8: 0.9 x 2 + 0.1 x 1.9 is 1.99, 0.9 x 1.99 + 0.1 x 1.8 is 1.971; no average in the warm-up."""
     config = TrainingConfig(2, 2, 0.1, weight_decay=0.0, warmup=warmup, ema_decay=0.9, validate_every=1)
-    kept, log = fit(Downhill(), Corpus.of(annotated, 0), config, 0, torch.device("cpu"))
-    assert [row["validation"] for row in log] == pytest.approx(expected)
-    assert float(next(kept.parameters())) == pytest.approx(expected[1])
+    average, log = fit(Downhill(), Corpus.of(annotated, 0), config, 0, torch.device("cpu"))
+    assert [entry["validation"] for entry in log] == pytest.approx(expected)
+    assert float(next(average.parameters())) == pytest.approx(expected[1])
 
 
 def test_the_learning_rate_warms_up_and_falls_to_zero() -> None:
     config = TrainingConfig(steps=110, warmup=10, schedule="cosine")
-    found = [learning_rate_factor(step, config) for step in (1, 10, 60, 110)]
-    assert found == pytest.approx([0.1, 1.0, 0.5, 0.0])
+    factors = [learning_rate_factor(step, config) for step in (1, 10, 60, 110)]
+    assert factors == pytest.approx([0.1, 1.0, 0.5, 0.0])
     assert learning_rate_factor(50, TrainingConfig(steps=100)) == 1
 
 
 def test_matrix_products_are_float32_on_every_processor() -> None:
-    """Products of bfloat16, which a CPU with AMX may be allowed, are off by 2e-3; on others only the setting shows."""
+    """Products in bfloat16, which torch may use on a CPU with AMX, are off by 2e-3; elsewhere the setting counts."""
     make_repeatable(threads=1)
     assert torch.get_float32_matmul_precision() == "highest"
     generator = torch.Generator().manual_seed(0)
@@ -424,22 +428,22 @@ def test_matrix_products_are_float32_on_every_processor() -> None:
     assert float((a @ b - exact).norm() / exact.norm()) < 1e-6
 
 
-def test_operations_that_may_give_other_bytes_are_refused_and_the_compiler_is_not_loaded() -> None:
+def test_nondeterministic_operations_are_refused_and_the_compiler_is_not_loaded() -> None:
     code = "import sys, torch; from models.common.repeatable import make_repeatable; make_repeatable(1); "
     code += "print(torch.get_deterministic_debug_mode(), 'torch._inductor' in sys.modules)"
-    told = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code], cwd=Path(__file__).parents[2], capture_output=True, text=True, check=True
     )
-    assert told.stdout.split() == ["2", "False"]
+    assert process.stdout.split() == ["2", "False"]
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 100])
-def test_every_epoch_meets_every_clip_once(annotated: AnnotatedStore, size: int) -> None:
+def test_every_epoch_contains_every_clip_once(annotated: AnnotatedStore, size: int) -> None:
     dataset = HoiDataset(annotated, "train")
     stream = batches(dataset, size, seed=0)
     for _ in range(3):
-        met: list[str] = []
-        while len(met) < len(dataset):
+        clip_ids: list[str] = []
+        while len(clip_ids) < len(dataset):
             [(_, batch)] = next(stream)
-            met += [sample.clip_id for sample in batch.samples]
-        assert sorted(met) == sorted(dataset.ids)
+            clip_ids += [sample.clip_id for sample in batch.samples]
+        assert sorted(clip_ids) == sorted(dataset.ids)

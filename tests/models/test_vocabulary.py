@@ -1,4 +1,4 @@
-"""What training had, and what of a sentence it never had, each with the nearest that it did."""
+"""The training vocabulary, and unseen words of a sentence with the most similar known ones."""
 
 import pytest
 
@@ -14,7 +14,7 @@ KNOWN = Vocabulary({("lift", "mug", "right"): 5, ("pour", "teapot", "right"): 3,
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "expected"),
     [
         ("", "words"),
         ("...", "words"),
@@ -24,8 +24,8 @@ KNOWN = Vocabulary({("lift", "mug", "right"): 5, ("pour", "teapot", "right"): 3,
         ("Levanta la taza con la mano derecha", "levanta"),
     ],
 )
-def test_what_is_no_english_sentence_is_refused_with_an_example(text, says):
-    with pytest.raises(BadInput, match=says) as error:
+def test_text_that_is_not_english_is_refused_with_an_example(text, expected):
+    with pytest.raises(BadInput, match=expected) as error:
         read_sentence(text)
     assert "Lift a mug with the right hand." in str(error.value) or "one action" in str(error.value)
 
@@ -58,11 +58,11 @@ ACTIONS = Vocabulary(
         ("now slowly,", "lift", []),
     ],
 )
-def test_a_second_action_of_a_sentence_is_named_where_training_had_it(text, made, further):
+def test_a_second_training_action_of_a_sentence_is_found(text, made, further):
     assert further_verbs(text, made, ACTIONS) == further
 
 
-def test_english_is_read_even_where_no_table_has_its_words():
+def test_english_is_accepted_without_words_of_the_table():
     assert read_sentence("Pour water from the teapot.") == ("pour", "teapot")
     assert read_sentence("Juggle three oranges with both hands") == (None, None)
     assert is_english("spatulas")
@@ -70,15 +70,15 @@ def test_english_is_read_even_where_no_table_has_its_words():
 
 
 @pytest.mark.parametrize(
-    ("verb", "thing", "hand", "says"),
+    ("verb", "noun", "hand", "expected"),
     [
         ("lift", "mug", "right", []),
         ("lift", "mug", "left", ["'lift' with 'mug' was in training, never with hand type 'left'"]),
         ("pour", "mug", "right", ["'pour' and 'mug' were each in training, never together"]),
     ],
 )
-def test_combinations_that_training_never_had_are_said(verb, thing, hand, says):
-    assert unseen_words(KNOWN, "", verb, thing, hand, load_encoder("hash")) == says
+def test_unseen_combinations_are_reported(verb, noun, hand, expected):
+    assert unseen_words(KNOWN, "", verb, noun, hand, load_encoder("hash")) == expected
 
 
 def test_unknown_words_come_with_the_nearest_known():
@@ -88,7 +88,7 @@ def test_unknown_words_come_with_the_nearest_known():
     assert "'vase'" in said[1]
 
 
-def test_a_known_object_beside_a_strange_verb_is_no_stranger():
+def test_a_known_object_with_an_unknown_verb_is_recognised():
     assert [
         note.split(" was")[0]
         for note in unseen_words(KNOWN, "Juggle a mug.", *read_sentence("Juggle a mug."), "right", load_encoder("hash"))
@@ -96,7 +96,7 @@ def test_a_known_object_beside_a_strange_verb_is_no_stranger():
     assert len(unseen_words(KNOWN, "Juggle a smug mugger.", None, None, "right", load_encoder("hash"))) == 2
 
 
-def test_the_better_known_sentence_scores_higher():
+def test_the_better_covered_sentence_scores_higher():
     scores = [
         KNOWN.knows(*words)
         for words in (("lift", "mug"), ("pour", "mug"), ("lift", "vase"), (None, "mug"), (None, None))

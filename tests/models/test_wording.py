@@ -1,4 +1,4 @@
-"""What a sentence means to networks: slips are corrected, synonyms replaced, and what would be guessed is refused."""
+"""Sentences: typing errors are corrected, synonyms replaced, and ambiguous words refused."""
 
 import csv
 from pathlib import Path
@@ -10,11 +10,11 @@ from hoidata.annotation.hand_choice import HAND_TYPES
 from hoidata.annotation.sentences import four_sentences, reference_sentences
 from hoidata.errors import BadInput
 from models.common.vocabulary import Vocabulary
-from models.text2hoi.wording import Wording, edits, understood_words
+from models.text2hoi.wording import Wording, edit_distance, understood_words
 
 VERBS = ("lift", "drink", "pour", "place", "take out", "inspect", "hand over", "pass")
 OBJECTS = ("mug", "water bottle", "wine glass", "large cube", "box", "book")
-KNOWN = Vocabulary({(verb, thing, "right"): 3 for verb in VERBS for thing in OBJECTS})
+KNOWN = Vocabulary({(verb, noun, "right"): 3 for verb in VERBS for noun in OBJECTS})
 SYNONYMS = [
     ("raise", "lift"),
     ("sip", "drink"),
@@ -31,7 +31,7 @@ def understood(text: str, force: bool = False, *names: str) -> Wording:
 
 
 @pytest.mark.parametrize(
-    ("text", "corrected", "verb", "thing"),
+    ("text", "corrected", "verb", "noun"),
     [
         ("Drnik from a mug with the right hand.", "Drink from a mug with the right hand.", "drink", "mug"),
         ("The mug is drunk form by teh left hand", "The mug is drunk form by the left hand", "drink", "mug"),
@@ -42,17 +42,17 @@ def understood(text: str, force: bool = False, *names: str) -> Wording:
         ("LFIT the mug", "Lift the mug", "lift", "mug"),
     ],
 )
-def test_a_slip_that_can_be_one_word_alone_is_corrected_and_said(
-    text: str, corrected: str, verb: str, thing: str
+def test_a_typing_error_with_one_possible_word_is_corrected_and_reported(
+    text: str, corrected: str, verb: str, noun: str
 ) -> None:
-    found = understood(text)
-    assert (found.text, found.verb, found.thing) == (corrected, verb, thing)
+    wording = understood(text)
+    assert (wording.text, wording.verb, wording.noun) == (corrected, verb, noun)
     changed = [(old, new) for old, new in zip(text.split(), corrected.split(), strict=True) if old != new]
-    assert list(found.notes) == [f"{old!r} is read as {new.lower()!r}" for old, new in changed]
+    assert list(wording.notes) == [f"{old!r} is read as {new.lower()!r}" for old, new in changed]
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "expected"),
     [
         ("Throw the ball", r"trained on \(drink, hand over, inspect.*\), got 'throw'; did you mean"),
         ("The ball is thrown by the left hand.", "got 'throw'"),
@@ -67,8 +67,8 @@ def test_a_slip_that_can_be_one_word_alone_is_corrected_and_said(
         ("Lift the gizmotron", "got 'gizmotron'; write it otherwise, or add --force"),
     ],
 )
-def test_what_would_have_to_be_guessed_is_refused_with_the_nearest(text: str, says: str) -> None:
-    with pytest.raises(BadInput, match=says) as error:
+def test_ambiguous_words_are_refused_with_suggestions(text: str, expected: str) -> None:
+    with pytest.raises(BadInput, match=expected) as error:
         understood(text)
     assert "--force" in str(error.value)
     forced = understood(text, force=True)
@@ -77,14 +77,14 @@ def test_what_would_have_to_be_guessed_is_refused_with_the_nearest(text: str, sa
 
 @pytest.mark.parametrize("form", range(4), ids=["imperative", "passive", "subject", "gerund"])
 @pytest.mark.parametrize(("synonym", "verb"), SYNONYMS)
-def test_a_synonym_becomes_the_verb_of_training_in_the_same_form(synonym: str, verb: str, form: int) -> None:
-    found = understood(four_sentences(synonym, "mug", "left")[form])
-    assert found == Wording(four_sentences(verb, "mug", "left")[form], verb, "mug", found.notes)
-    assert found.notes == (f"{synonym!r} is read as {verb!r}",)
+def test_a_synonym_becomes_the_training_verb_in_the_same_form(synonym: str, verb: str, form: int) -> None:
+    wording = understood(four_sentences(synonym, "mug", "left")[form])
+    assert wording == Wording(four_sentences(verb, "mug", "left")[form], verb, "mug", wording.notes)
+    assert wording.notes == (f"{synonym!r} is read as {verb!r}",)
 
 
 @pytest.mark.parametrize(
-    ("text", "verb", "thing"),
+    ("text", "verb", "noun"),
     [
         ("Take the water bottle out.", "take out", "water bottle"),
         ("Put the plate down with the left hand", "place", "plate"),
@@ -98,25 +98,25 @@ def test_a_synonym_becomes_the_verb_of_training_in_the_same_form(synonym: str, v
         ("Lift the smartphone", "lift", "smartphone"),
     ],
 )
-def test_verb_and_object_are_found_apart_and_without_a_table(text: str, verb: str, thing: str | None) -> None:
-    assert understood(text) == Wording(text, verb, thing, understood(text).notes)
+def test_separated_verbs_and_unknown_objects_are_found(text: str, verb: str, noun: str | None) -> None:
+    assert understood(text) == Wording(text, verb, noun, understood(text).notes)
 
 
-def test_what_the_mesh_is_called_is_a_word() -> None:
+def test_the_name_of_the_mesh_is_a_word() -> None:
     assert understood("Lift the gizmotron.", False, "my_gizmotron-2").verb == "lift"
 
 
-def test_every_sentence_that_the_corpora_have_is_read_as_it_is() -> None:
+def test_sentences_of_the_corpora_are_unchanged() -> None:
     for verb in VERBS:
-        for thing in (*OBJECTS, "plate", "capsule machine", "SD card"):
+        for noun in (*OBJECTS, "plate", "capsule machine", "SD card"):
             for hand in HAND_TYPES:
-                for text in (*four_sentences(verb, thing, hand), *reference_sentences(verb, thing, hand)):
+                for text in (*four_sentences(verb, noun, hand), *reference_sentences(verb, noun, hand)):
                     assert understood(text).verb == verb, text
                     assert understood(text).text == text
 
 
-def test_words_of_sixty_sentences_that_people_wrote_are_no_slips() -> None:
-    """All but "bimanual": a verb of no dataset is another matter."""
+def test_sixty_sentences_by_people_have_no_false_corrections() -> None:
+    """All words are accepted except for "bimanual"; unknown verbs are tested elsewhere."""
     path = Path(__file__).parents[1] / "hoidata" / "annotation" / "blind_sentences.csv"
     stopped = []
     for row in csv.DictReader(path.read_text().splitlines()):
@@ -128,17 +128,17 @@ def test_words_of_sixty_sentences_that_people_wrote_are_no_slips() -> None:
     assert stopped == ["'Bimanual'"]
 
 
-def test_edits_are_those_of_one_letter_or_of_two_neighbours() -> None:
-    assert [edits("drnik", other, 2) for other in ("drink", "drnik", "drunk", "lift")] == [1, 0, 2, 3]
-    assert [edits(*words, 2) for words in (("mg", "mug"), ("muug", "mug"), ("mag", "mug"), ("gmu", "mug"))] == [
+def test_edit_distance_counts_letters_and_exchanged_neighbours() -> None:
+    assert [edit_distance("drnik", other, 2) for other in ("drink", "drnik", "drunk", "lift")] == [1, 0, 2, 3]
+    assert [edit_distance(*words, 2) for words in (("mg", "mug"), ("muug", "mug"), ("mag", "mug"), ("gmu", "mug"))] == [
         1,
         1,
         1,
         2,
     ]
-    assert edits("lift", "lifting", 2) == 3
+    assert edit_distance("lift", "lifting", 2) == 3
 
 
-def test_models_that_name_no_verbs_refuse_none() -> None:
+def test_models_without_verbs_refuse_none() -> None:
     nothing = Vocabulary({("", "mug", "right"): 1})
     assert understood_words("Throw the mug", nothing, lambda: load_encoder("hash")).verb == "throw"

@@ -12,21 +12,26 @@ TRANSFORMER = {
 BUDGET = {"steps": 2, "batch": 2, "learning_rate": 0.001, "validate_every": 1, "ema_decay": 0.5}
 PARAMS = {
     "contact": {
-        "network": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8], "drawn_by": "anchor"},
+        "network": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8], "sampled_from": "anchor_points"},
         "training": BUDGET,
     },
     "length": {
-        "network": {"width": 16, "drawn_by": "spread", "text_input": "verbs", "told": True},
+        "network": {
+            "width": 16,
+            "sampled_from": "gaussian",
+            "text_input": "verb_probabilities",
+            "condition_on_hands_and_length": True,
+        },
         "training": {**BUDGET, "keep_best": True},
     },
     "diffusion": {
         "network": {
             "transformer": TRANSFORMER,
             "contact_input": "tokens",
-            "text_input": "verbs",
+            "text_input": "verb_probabilities",
             "motion": {"knot_frames": 4},
             "normalised": True,
-            "told": True,
+            "condition_on_hands_and_length": True,
             "object_dropout": 0.5,
             "scale_input": False,
         },
@@ -41,7 +46,7 @@ PARAMS = {
             "output": "residual",
         },
         "training": BUDGET,
-        "loss": {"generated": "half", "samples": 2, "sampler_steps": 2, "field_resolution": 16},
+        "loss": {"coarse_motions": "half_sampled", "samples": 2, "sampler_steps": 2, "field_resolution": 16},
     },
 }
 

@@ -149,12 +149,12 @@ def test_encoder_points_and_sampling_are_those_of_the_profile_that_is_asked_for(
     own = {
         "annotate": {"encoder": "hash"},
         "contact": {"points": 512},
-        "sample": {"text2hoi": {"draws": 1, "precision": "float16"}},
+        "sample": {"text2hoi": {"max_attempts": 1, "precision": "float16"}},
     }
     values = {**PARAMS, "profile": "embedded", "profiles": {"own": own}}
     found = [models_of(profile, values) for profile in ("embedded", "own")]
     assert [(one.hands, one.encoder, one.points) for one in found] == [("embedded", "use", 1024), ("own", "hash", 512)]
-    assert [one.sampling.draws for one in found] == [5, 1]
+    assert [one.sampling.max_attempts for one in found] == [5, 1]
     assert {one.sampling.precision for one in found} == {"float32"}
 
 

@@ -85,17 +85,17 @@ def test_a_setting_on_the_command_line_is_read_as_in_the_file():
 
 
 def planned(params: Path, network: str) -> None:
-    from models.common.training import Plan
+    from models.common.training import TrainingSpec
     from models.registry import load_network
 
-    Plan.of(load_network(network), load_settings(TrainParams, "train", params).of(network))
+    TrainingSpec.of(load_network(network), load_settings(TrainParams, "train", params).of(network))
 
 
 @pytest.mark.parametrize(
     ("keys", "value", "key", "words"),
     [
         ("train.small.length.training.learning_rate", "fast", None, "expected float, got 'fast'"),
-        ("train.ours.length.network.verbs", "loud", None, "expected int, got 'loud'"),
+        ("train.ours.length.network.verb_count", "loud", None, "expected int, got 'loud'"),
         ("profiles.embedded.train.small.length.training.batch", 1.5, None, "expected int, got 1.5"),
         ("train.small.length.training.steps", 0, None, "expected 1 or more, got 0"),
         ("train.small.length.training.stepps", 3, "train.small.length.training", "expected keys among: .*got stepps"),

@@ -13,7 +13,7 @@ from models.bimart.network import DenoiserConfig
 from models.bimart.sampler import SamplingConfig, preset_of
 from models.bimart.scene import FeatureConfig
 from models.bimart.training import LossConfig
-from models.common.training import Plan
+from models.common.training import TrainingSpec
 from models.registry import load_network
 from pipelines.stages.train import TrainParams
 
@@ -21,9 +21,9 @@ SECTION: dict[str, Any] = yaml.safe_load((Path(__file__).parents[3] / "params.ya
 NETWORKS = ("bimart-contact", "bimart-motion")
 
 
-def training_plan(preset: str, size: str, name: str) -> Plan:
+def training_plan(preset: str, size: str, name: str) -> TrainingSpec:
     params = build_config(TrainParams, {**SECTION, "preset": preset, "size": size}, "params.yaml: train")
-    return Plan.of(load_network(name), params.of(name))
+    return TrainingSpec.of(load_network(name), params.of(name))
 
 
 def differences(first: Any, second: Any, name: str = "") -> set[str]:

@@ -38,7 +38,7 @@ def motion(page_clip):
         "unseen": ["the object 'vase' was never in training"],
         "contact_threshold_m": 0.02,
         "checkpoints": {"contact": "ab" * 32},
-        "refined_by": "hold",
+        "refined_by": "contact_refinement",
         "trained_on": {"grab": 12},
     }
     return GeneratedMotion(clip, page_clip(frames=clip.n_frames), points.points_m[:, 0] > 0.039, points, evidence)
