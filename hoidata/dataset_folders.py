@@ -1,8 +1,8 @@
-"""Where the folder of a dataset lies, and what stands in its ``facts.toml``: found by name, no adapter is imported.
+"""Finds the folder of a dataset by name and reads its ``facts.toml``, without importing the adapter.
 
-A dataset is a folder with its name: ``adapter.py``, ``facts.toml`` and, where there are any, ``splits/*.json`` and
-``published.json``. Folders stand in hoidata/datasets, or anywhere else and are listed by the user: in the environment
-variable HOIDATA_DATASETS (several joined by ``:``), or in hoidata.toml of the project folder::
+A dataset is a folder of that name with ``adapter.py``, ``facts.toml`` and optionally ``splits/*.json`` and
+``published.json``. Built-in folders are in hoidata/datasets. Users list further ones in the environment variable
+HOIDATA_DATASETS, joined by ``:``, or in hoidata.toml of the project folder::
 
     [datasets]
     paths = ["../kitchen"]
@@ -24,34 +24,28 @@ REMEDY = "correct it; hoidata/datasets/README.md shows a whole one"
 
 @dataclass(frozen=True)
 class DatasetFacts:
-    """What is known of a dataset without reading any of it; each fact stands in its ``facts.toml`` and nowhere else.
+    """Facts about a dataset, from ``facts.toml`` of its folder."""
 
-    name: of the folder. title: as pages write it. paper: authors, title, venue and year. source_fps: frames per second.
-    needs_mano: raw files hold MANO parameters. may_be_shared: the licence lets derived data be passed on.
-    split: the one used unless params.yaml chooses another; "" where the user has to choose.
-    conventions: what the source means by its numbers, in one line each, by the names of ``CONVENTIONS.md``'s rows.
-    licences: ``licence`` and ``may_be_shared`` of arrays that are not under the dataset's, as dataset cards name them.
-    """
-
-    name: str
-    title: str
-    version: str
+    name: str  # of the folder
+    title: str  # name on pages
+    version: str  # of the release that the adapter reads
     licence: str
-    may_be_shared: bool
+    may_be_shared: bool  # the licence permits passing on derived data
     where_to_register: str
-    needs_mano: bool
+    needs_mano: bool  # raw files have MANO parameters
     source_fps: float
-    paper: str = ""
-    split: str = ""
-    conventions: dict[str, str] = field(default_factory=dict)
+    paper: str = ""  # authors, title, venue and year
+    split: str = ""  # name of the default split; "" if the user has to choose one in params.yaml
+    conventions: dict[str, str] = field(default_factory=dict)  # by row of CONVENTIONS.md, one line each
+    # ``licence`` and ``may_be_shared`` of arrays under another licence, by their name in dataset cards
     licences: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
-# What TOML gives for a field of each type.
-_KINDS: dict[Any, tuple[type, ...]] = {
+# Python types that TOML returns for a field of each type.
+_TOML_TYPES: dict[Any, tuple[type, ...]] = {
     str: (str,), bool: (bool,), float: (float, int), dict[str, str]: (dict,), dict[str, dict[str, Any]]: (dict,),
 }  # fmt: skip
-_OF_ARRAYS = {"licence": str, "may_be_shared": bool}
+_LICENCE_ENTRY_TYPES = {"licence": str, "may_be_shared": bool}
 
 
 def built_in_names() -> list[str]:
@@ -60,9 +54,9 @@ def built_in_names() -> list[str]:
 
 
 def outside_folders() -> dict[str, Path]:
-    """The folders the user lists, by name; a built-in name cannot be taken over."""
-    named = [Path(path) for path in os.environ.get(VARIABLE, "").split(os.pathsep) if path]
-    listed = named or [machine_folder() / Path(path).expanduser() for path in _listed_in_settings()]
+    """The folders that the user lists, by name. A folder cannot replace a built-in dataset."""
+    from_environment = [Path(path) for path in os.environ.get(VARIABLE, "").split(os.pathsep) if path]
+    listed = from_environment or [machine_folder() / Path(path).expanduser() for path in _listed_in_settings()]
     folders = [path.expanduser().absolute() for path in listed]
     for folder in folders:
         if not (folder / "adapter.py").is_file() or not folder.name.isidentifier():
@@ -72,40 +66,40 @@ def outside_folders() -> dict[str, Path]:
 
 
 def dataset_folder(name: str) -> Path | None:
-    """The folder of a dataset; None for one of another package, or that nobody knows."""
+    """The folder of a dataset; None if it is unknown or registered by another package."""
     return BUILT_IN / name if name in built_in_names() else outside_folders().get(name)
 
 
 def dataset_facts(name: str) -> DatasetFacts | None:
-    """What is known of a dataset by name; None where it has no folder, or one without ``facts.toml``."""
+    """The facts of a dataset; None if it has no folder, or no ``facts.toml`` in it."""
     folder = dataset_folder(name)
     return _read_facts(folder) if folder is not None and (folder / "facts.toml").is_file() else None
 
 
-def facts_beside(file: str) -> DatasetFacts:
-    """The facts of the dataset in whose folder ``file`` lies: an adapter's ``__file__``."""
+def facts_of_adapter(file: str) -> DatasetFacts:
+    """The facts of a dataset, given ``__file__`` of its adapter."""
     return _read_facts(Path(file).parent)
 
 
 def dataset_title(name: str) -> str:
-    """The dataset's name as pages write it."""
+    """The dataset's name on pages."""
     facts = dataset_facts(name)
     return name if facts is None else facts.title
 
 
 def _read_facts(folder: Path) -> DatasetFacts:
-    """``facts.toml`` of a dataset's folder. Raises BadInput that names the entry that is wrong or missing."""
+    """Read ``facts.toml`` of a dataset's folder. Raises BadInput that names the wrong or missing entry."""
     path = folder / "facts.toml"
     values = _read_toml(path)
-    known = {item.name: _KINDS[item.type] for item in fields(DatasetFacts) if item.name != "name"}
-    if wrong := sorted(values.keys() - known.keys()):
-        raise BadInput(path, f"entries among: {', '.join(known)}", ", ".join(wrong), REMEDY)
+    types = {item.name: _TOML_TYPES[item.type] for item in fields(DatasetFacts) if item.name != "name"}
+    if wrong := sorted(values.keys() - types.keys()):
+        raise BadInput(path, f"entries among: {', '.join(types)}", ", ".join(wrong), REMEDY)
     for key, value in values.items():
-        if type(value) not in known[key]:
-            raise BadInput(f"{path}: {key}", known[key][0].__name__, repr(value)[:40], REMEDY)
-    for kind, own in values.get("licences", {}).items():
-        if not isinstance(own, dict) or {name: type(value) for name, value in own.items()} != _OF_ARRAYS:
-            raise BadInput(f"{path}: licences.{kind}", "a licence and may_be_shared", repr(own)[:80], REMEDY)
+        if type(value) not in types[key]:
+            raise BadInput(f"{path}: {key}", types[key][0].__name__, repr(value)[:40], REMEDY)
+    for arrays, entry in values.get("licences", {}).items():
+        if not isinstance(entry, dict) or {key: type(value) for key, value in entry.items()} != _LICENCE_ENTRY_TYPES:
+            raise BadInput(f"{path}: licences.{arrays}", "a licence and may_be_shared", repr(entry)[:80], REMEDY)
     try:
         return DatasetFacts(folder.name, **values)
     except TypeError as error:
@@ -113,7 +107,7 @@ def _read_facts(folder: Path) -> DatasetFacts:
 
 
 def _listed_in_settings() -> list[str]:
-    """``[datasets] paths`` of hoidata.toml; none without that file."""
+    """``[datasets] paths`` of hoidata.toml; empty without that file."""
     path = machine_folder() / SETTINGS
     if not path.is_file():
         return []

@@ -81,7 +81,7 @@ def small_corpus(made_once) -> Callable[[str], SimpleNamespace]:
             (folder / "truths.pkl").write_bytes(pickle.dumps(truths))
             adapter, hands = get_adapter(name), load_embedded_hands()
             summary = convert_dataset(adapter, folder / "raw", hands, folder / "clips", progress=False, synthetic=True)
-            assert summary.left_out == ()
+            assert summary.quarantined == ()
 
         folder = made_once(f"small-{name}", fill)
         truths = pickle.loads((folder / "truths.pkl").read_bytes())

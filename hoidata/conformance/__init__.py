@@ -1,1 +1,1 @@
-"""Whether an adapter keeps the rules, tried on raw files: for built-in adapters and those of others."""
+"""Tests any adapter on raw files: built-in ones and those of other packages."""

@@ -1,8 +1,8 @@
-"""Whether an adapter keeps the rules of this room, tried on real input: for built-in adapters and those of others.
+"""Tests an adapter against the rules of ``hoidata.datasets.base.Adapter`` on raw files.
 
-``check_adapter`` knows nothing of the dataset. It reads the declared facts, loads a few sequences, measures their
-clips, and loads them again from copies of the raw folder: whole, partly missing, damaged, and in another process.
-The raw folder itself is never written to.
+``check_adapter`` is independent of the dataset. It reads the declared facts, loads a few sequences and measures their
+clips. It loads the sequences again from copies of the raw folder: complete, partial, damaged, and in another process.
+It never writes to the raw folder.
 """
 
 import pickle
@@ -30,11 +30,17 @@ TRIES_PER_SEQUENCE = 15
 def check_adapter(
     adapter: Adapter, root: str | Path, hands: HandPair, sequences: int = 4, worker: bool = True
 ) -> list[Finding]:
-    """Every rule with its outcome, in a fixed order; an adapter conforms when none is "fail".
+    """Try every rule on an adapter.
 
-    root: a raw folder the adapter can read, with at least one sequence that gives a clip; two or more let the rules
-    about other sequences be tried. sequences: so many are loaded, spread evenly over those there are. worker: load
-    one in a process of its own too (the adapter's module must be importable there).
+    Args:
+        adapter: the adapter to test.
+        root: a raw folder with at least one sequence that gives a clip. Rules about other sequences need two or more.
+        hands: hand models of both sides.
+        sequences: number of sequences to load, spread evenly over the dataset.
+        worker: also load one sequence in another process, in which the adapter's module must be importable.
+
+    Returns:
+        Every rule with its outcome, in a fixed order. The adapter conforms if no outcome is "fail".
     """
     root = Path(root)
     missing = [name for name in (*FACTS, "sequences", "load") if not hasattr(adapter, name)]
@@ -60,9 +66,11 @@ def check_adapter(
     if not loaded:
         return findings
     findings += clip_findings(adapter, loaded)
-    # What has arrays of the wrong shape cannot be measured, and has been found.
-    sound = [clip for item in loaded for clip in item.clips if is_valid(clip)]
-    findings += touch_findings(sound, hands) if sound else [skipped("hands touch the object", "no clip is valid")]
+    # Clips with arrays of the wrong shape cannot be measured; clip_findings reports them.
+    valid_clips = [clip for item in loaded for clip in item.clips if is_valid(clip)]
+    findings += (
+        touch_findings(valid_clips, hands) if valid_clips else [skipped("hands touch the object", "no clip is valid")]
+    )
     with tempfile.TemporaryDirectory(prefix="hoidata-check-") as folder:
         findings += trial_findings(adapter, root, Path(folder), loaded, hands, worker)
     return findings
@@ -87,8 +95,8 @@ def _convention(adapter: Adapter) -> list[str]:
     convention, problems = adapter.hand_convention, []
     if not convention.note:
         problems.append("hand_convention has no note")
-    own_betas = convention.shape in ("betas per frame", "betas per sequence")
-    if own_betas == (convention.left_shape == "unused"):
+    has_betas = convention.shape in ("betas per frame", "betas per sequence")
+    if has_betas == (convention.left_shape == "unused"):
         problems.append(f"shape is {convention.shape!r}, left_shape {convention.left_shape!r}: they exclude each other")
     if not 0 <= convention.components <= 45:
         problems.append(f"components is {convention.components}, not 0 to 45")
@@ -105,8 +113,8 @@ def _frame(adapter: Adapter) -> list[str]:
         problems.append("frame says that gravity is stated, but not which axis is up")
     if not adapter.parts:
         problems.append("parts is empty: what a raw folder holds is not stated")
-    unclear = [part for part in adapter.parts if not (part.what and part.patterns and part.where)]
-    return problems + [f"the part {part.what!r} lacks words, patterns or its archive" for part in unclear]
+    unclear = [part for part in adapter.parts if not (part.contents and part.patterns and part.archive)]
+    return problems + [f"the part {part.contents!r} lacks words, patterns or its archive" for part in unclear]
 
 
 def _licence(adapter: Adapter) -> list[str]:
@@ -118,13 +126,13 @@ def _licence(adapter: Adapter) -> list[str]:
 
 def _picklable(adapter: Adapter) -> list[str]:
     if not is_dataclass(adapter):
-        return ["it is no dataclass"]
-    frozen = getattr(type(adapter), "__dataclass_params__").frozen  # noqa: B009 - the type checker knows no such name
+        return ["it is not a dataclass"]
+    frozen = getattr(type(adapter), "__dataclass_params__").frozen  # noqa: B009 - not declared for type checkers
     problems = [] if frozen else ["its dataclass is not frozen"]
     try:
-        if pickle.loads(pickle.dumps(adapter)) != adapter:  # our own object, just made
+        if pickle.loads(pickle.dumps(adapter)) != adapter:  # an object of this process, not foreign data
             problems.append("its copy is not equal to it")
-    except Exception as error:  # whatever a foreign class raises
+    except Exception as error:  # a foreign class can raise anything
         problems.append(f"it cannot be pickled: {error}")
     try:
         type(adapter)()
@@ -136,8 +144,8 @@ def _picklable(adapter: Adapter) -> list[str]:
 def _parts(adapter: Adapter, root: Path) -> list[str]:
     absent = [part for part in adapter.parts if not part.optional and not part.is_in(root)]
     return [
-        f"no {part.what} ({', '.join(part.patterns)}); it comes from {part.where}"
-        + (f"; the setting {part.unneeded_with} does without it" if part.unneeded_with else "")
+        f"no {part.contents} ({', '.join(part.patterns)}); it comes from {part.archive}"
+        + (f"; it is not needed with the setting {part.unneeded_with}" if part.unneeded_with else "")
         for part in absent
     ]
 
@@ -147,12 +155,12 @@ def _keys(adapter: Adapter, keys: list[SequenceKey]) -> list[str]:
     if keys != sorted(keys):
         problems.append("they are not sorted")
     if len(set(map(str, keys))) != len(keys):
-        problems.append("one is there twice")
+        problems.append("one is duplicated")
     for key in keys:
         if key.dataset != adapter.name:
             problems.append(f"{key.name} belongs to {key.dataset!r}, not {adapter.name!r}")
         elif not key.subject or not _is_plain_path(key.name):
-            problems.append(f"{key.name!r} of the subject {key.subject!r} is no plain name")
+            problems.append(f"{key.name!r} of the subject {key.subject!r} is not a plain name")
     with tempfile.TemporaryDirectory(prefix="hoidata-check-") as empty:
         if adapter.sequences(Path(empty)):
             problems.append("an empty folder has sequences")
@@ -166,21 +174,21 @@ def _is_plain_path(name: str) -> bool:
 
 
 def _load_some(
-    adapter: Adapter, root: Path, keys: list[SequenceKey], hands: HandPair, wanted: int
+    adapter: Adapter, root: Path, keys: list[SequenceKey], hands: HandPair, n_sequences: int
 ) -> tuple[list[Loaded], list[Loaded]]:
-    """So many sequences that give clips, in the order of their keys, and those tried in vain."""
-    good: list[Loaded] = []
-    bad: list[Loaded] = []
-    for key in _spread(keys)[: wanted * TRIES_PER_SEQUENCE]:
+    """Load sequences until ``n_sequences`` give clips. Returns those and the ones without clips, sorted by key."""
+    loaded: list[Loaded] = []
+    refused: list[Loaded] = []
+    for key in _spread(keys)[: n_sequences * TRIES_PER_SEQUENCE]:
         item = load_recorded(adapter, root, key, hands)
-        (good if item.clips else bad).append(item)
-        if len(good) == wanted:
+        (loaded if item.clips else refused).append(item)
+        if len(loaded) == n_sequences:
             break
-    return sorted(good, key=lambda item: item.key), sorted(bad, key=lambda item: item.key)
+    return sorted(loaded, key=lambda item: item.key), sorted(refused, key=lambda item: item.key)
 
 
 def _spread(keys: list[Any]) -> list[Any]:
-    """The keys in an order whose first n are spread over all: first, last, middle, quarters and so on."""
+    """Reorder keys so that the first n are spread over all: first, last, middle, quarters and so on."""
     order, step = [0, len(keys) - 1], len(keys) - 1
     while step > 1:
         step = -(-step // 2)
@@ -189,12 +197,12 @@ def _spread(keys: list[Any]) -> list[Any]:
 
 
 def _loading_findings(loaded: list[Loaded], refused: list[Loaded]) -> list[Finding]:
-    reasons = [f"{item.key}: {item.problem or 'everything in it is left out'}" for item in refused]
+    reasons = [f"{item.key}: {item.problem or 'it gives no clip'}" for item in refused]
     crashes = [f"{item.key}: {item.problem}" for item in refused if item.crashed]
     rule = "files are read through the RawTree only"
-    behind = [f"{item.key}: {path} is opened behind its back" for item in loaded for path in item.unrecorded]
+    unrecorded = [f"{item.key}: {path} is opened without it" for item in loaded for path in item.unrecorded]
     return [
         finding("at least one sequence gives a clip", [] if loaded else reasons),
-        finding("what cannot be used raises BadInput, nothing else", crashes),
-        finding(rule, behind) if loaded else skipped(rule, "nothing was loaded"),
+        finding("unusable input raises BadInput, nothing else", crashes),
+        finding(rule, unrecorded) if loaded else skipped(rule, "nothing was loaded"),
     ]

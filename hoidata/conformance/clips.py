@@ -1,4 +1,4 @@
-"""Rules every clip of an adapter keeps, whatever the dataset: ids, words, times, units, frames, sources."""
+"""Rules for the clips of every adapter: ids, words, times, units, frames, sources."""
 
 import re
 from collections.abc import Callable
@@ -16,41 +16,41 @@ from hoidata.objects.distance import volume_m3
 from hoidata.objects.model import ObjectModel
 
 VERB = re.compile(r"[a-z]+( [a-z]+)*")
-NOUN = re.compile(r"[A-Z]?[a-z]+([ '-][A-Z]?[a-z]+)*")  # a proper name may be among them: Stanford bunny
+NOUN = re.compile(r"[A-Z]?[a-z]+([ '-][A-Z]?[a-z]+)*")  # words may be capitalized: Stanford bunny
 UP_AXES = {f"{sign}{axis}": i for i, axis in enumerate("xyz") for sign in "+-"}
-LARGEST_FIT_ERROR_M = 0.015
-FEWEST_VALID = 0.5
-LEAST_VOLUME = 0.01
+MAX_FIT_ERROR_M = 0.015
+MIN_VALID_FRACTION = 0.5
+MIN_VOLUME_FRACTION = 0.01
 
 ClipRule = Callable[[Adapter, Clip], list[str]]
 
 
 def clip_findings(adapter: Adapter, loaded: list[Loaded]) -> list[Finding]:
-    """The rules over all results of some sequences."""
+    """Apply the rules to all results of the loaded sequences."""
     clips = list(chain.from_iterable(item.clips for item in loaded))
 
     def per_clip(rule: str, check: ClipRule) -> Finding:
         return finding(rule, [f"{clip.clip_id}: {text}" for clip in clips for text in _tried(check, adapter, clip)])
 
     return [
-        finding("results are clips or left-out stretches", _kinds(loaded)),
+        finding("results are clips or quarantined intervals", _kinds(loaded)),
         finding("ids come from the sequence's key and are unique", _ids(loaded)),
-        per_clip("clips say where they come from", _origin),
-        finding("clips name the files they were made from", _sources(loaded)),
+        per_clip("clips state dataset, subject and sequence", _origin),
+        finding("clips name their source files", _sources(loaded)),
         _undeclared(adapter, loaded),
         per_clip("clips are valid: shapes, finite numbers, possible sizes", _validity),
-        _clocks(clips, per_clip("frames are 1/30 s apart by the source's own clock", _clock)),
+        _clocks(clips, per_clip("frames are 1/30 s apart by the source's clock", _clock)),
         per_clip("words are words: a lower-case verb or None, and a noun", _words),
         per_clip("gravity is as declared, or None with a note", _gravity),
-        per_clip("the way back to the source is a similarity", _way_back),
+        per_clip("source_from_world is a similarity transform", _source_transform),
         per_clip("hands are from parameters, or fitted with a stated error", _hands_from),
         _mirrored(clips),
-        finding("both hands are there", _both_hands(clips), "warn"),
+        finding("both hands are present", _both_hands(clips), "warn"),
     ]
 
 
 def _tried(check: ClipRule, adapter: Adapter, clip: Clip) -> list[str]:
-    """What is wrong by a rule; nothing where the rule itself fails on arrays that are known not to be a clip's."""
+    """Problems by one rule. A rule that raises on an invalid clip reports none, because ``_validity`` does."""
     try:
         return check(adapter, clip)
     except Exception:
@@ -65,15 +65,15 @@ def _kinds(loaded: list[Loaded]) -> list[str]:
 
 
 def _ids(loaded: list[Loaded]) -> list[str]:
-    problems, seen = [], set()
+    problems, earlier_ids = [], set()
     for item in loaded:
         names = [clip.clip_id for clip in item.clips]
-        left_out = [result.source_key for result in item.results if isinstance(result, Quarantined)]
-        for name in names + left_out:
+        quarantined = [result.source_key for result in item.results if isinstance(result, Quarantined)]
+        for name in names + quarantined:
             if name != str(item.key) and not name.startswith(f"{item.key}/"):
                 problems.append(f"{name} does not begin with {item.key}")
-        problems += [f"{name} is there twice" for name in names if name in seen or names.count(name) > 1]
-        seen.update(names)
+        problems += [f"{name} is duplicated" for name in names if name in earlier_ids or names.count(name) > 1]
+        earlier_ids.update(names)
     return problems
 
 
@@ -89,11 +89,11 @@ def _origin(adapter: Adapter, clip: Clip) -> list[str]:
 def _sources(loaded: list[Loaded]) -> list[str]:
     problems = []
     for item in loaded:
-        known = {source.path: source for source in item.sources}
+        read_files = {source.path: source for source in item.sources}
         for clip in item.clips:
             if not clip.sources:
                 problems.append(f"{clip.clip_id}: none")
-            problems += [f"{clip.clip_id}: {s.path} was not read" for s in clip.sources if known.get(s.path) != s]
+            problems += [f"{clip.clip_id}: {s.path} was not read" for s in clip.sources if read_files.get(s.path) != s]
     return problems
 
 
@@ -101,12 +101,12 @@ def _undeclared(adapter: Adapter, loaded: list[Loaded]) -> Finding:
     rule, paths = "files that are read belong to a declared part", {s.path for item in loaded for s in item.sources}
     if not paths:
         return undecided(rule, "no file was read through the RawTree")
-    undeclared = [path for path in sorted(paths) if not any(part.holds(path) for part in adapter.parts)]
+    undeclared = [path for path in sorted(paths) if not any(part.matches(path) for part in adapter.parts)]
     return finding(rule, [f"{path} matches no pattern of parts: `raw scan` would leave it out" for path in undeclared])
 
 
 def is_valid(clip: Clip) -> bool:
-    """Whether its arrays are what a clip's are, so that it can be measured."""
+    """Whether the clip passes ``check_clip``, so that it can be measured."""
     return not _validity(None, clip)
 
 
@@ -126,7 +126,7 @@ def _clock(adapter: Adapter, clip: Clip) -> list[str]:
     if not 1 <= clip.source_fps <= 1000:
         return [f"source_fps is {clip.source_fps}"]
     passed_s = (clip.source_frames - clip.source_frames[0]) / clip.source_fps
-    # A made frame has the number of the one before it, so its own time is not told.
+    # An interpolated frame has the source number of the frame before it, so only recorded frames have a time.
     drift_s = np.abs(passed_s - np.arange(clip.n_frames) / FPS)[clip.recorded].max()
     if drift_s > 1 / FPS + 1e-6:
         seconds = f"{clip.n_frames} frames at {FPS} per second are {(clip.n_frames - 1) / FPS:.2f} s"
@@ -134,10 +134,10 @@ def _clock(adapter: Adapter, clip: Clip) -> list[str]:
     return []
 
 
-def _clocks(clips: list[Clip], found: Finding) -> Finding:
-    """The clock may be off by one frame, so clips of three frames and fewer would pass at any rate."""
+def _clocks(clips: list[Clip], clock_finding: Finding) -> Finding:
+    """Undecided for clips of at most three frames: the tolerance of one frame would accept any rate."""
     longest = max((clip.n_frames for clip in clips), default=0)
-    return undecided(found.rule, f"the longest clip has {longest} frames") if longest < 4 else found
+    return undecided(clock_finding.rule, f"the longest clip has {longest} frames") if longest < 4 else clock_finding
 
 
 def _words(adapter: Adapter, clip: Clip) -> list[str]:
@@ -164,10 +164,10 @@ def _gravity(adapter: Adapter, clip: Clip) -> list[str]:
     return [] if np.allclose(clip.gravity, down, atol=1e-6) else [f"gravity {clip.gravity}, up is {frame.up_axis}"]
 
 
-def _way_back(adapter: Adapter, clip: Clip) -> list[str]:
+def _source_transform(adapter: Adapter, clip: Clip) -> list[str]:
     matrix = np.asarray(clip.source_from_world, dtype=np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], (0, 0, 0, 1)):
-        return ["source_from_world is no 4x4 matrix that shifts and turns points"]
+        return ["source_from_world is not a 4x4 transform of points"]
     square = matrix[:3, :3] @ matrix[:3, :3].T
     scale = np.trace(square) / 3
     is_similar = scale > 0 and np.allclose(square, scale * np.eye(3), atol=1e-4 * scale)
@@ -175,28 +175,36 @@ def _way_back(adapter: Adapter, clip: Clip) -> list[str]:
 
 
 def _hands_from(adapter: Adapter, clip: Clip) -> list[str]:
-    fitted = clip.hands_from == "keypoints"  # a setting may ask for it where a source has parameters too
-    if adapter.hand_convention.shape == "fitted" and not fitted:
+    is_fitted = clip.hands_from == "keypoints"  # a setting may select keypoints although the source has parameters
+    if adapter.hand_convention.shape == "fitted" and not is_fitted:
         return [f"hands_from is {clip.hands_from!r}, the declared shape 'fitted'"]
-    if (clip.fit_error_m is None) == fitted:
-        return ["fit_error_m is to be stated where hands are fitted, and only there"]
-    if clip.fit_error_m is not None and not 0 <= clip.fit_error_m <= LARGEST_FIT_ERROR_M:
+    if (clip.fit_error_m is None) == is_fitted:
+        return ["fit_error_m must be stated if and only if hands are fitted"]
+    if clip.fit_error_m is not None and not 0 <= clip.fit_error_m <= MAX_FIT_ERROR_M:
         return [f"the fit misses the joints by {clip.fit_error_m * 1e3:.1f} mm: joint order, side or unit?"]
     return []
 
 
 def _mirrored(clips: list[Clip]) -> Finding:
-    """By the sign of the volume. Less than 1 % of the bounding box, as of thin sheets, decides nothing."""
+    """A mirrored mesh has negative volume. Below 1 % of the bounding box, as for thin sheets, it is undecided."""
     rule = "object meshes are not turned inside out (mirrored)"
-    named = [(clip.clip_id, track.model) for clip in clips for track in (clip.object, *clip.other_objects)]
-    shares = [(clip_id, model.name, share) for clip_id, model in named if (share := _volume_share(model)) is not None]
-    if not any(abs(share) >= LEAST_VOLUME for *_, share in shares):
+    models = [(clip.clip_id, track.model) for clip in clips for track in (clip.object, *clip.other_objects)]
+    volume_fractions = [
+        (clip_id, model.name, fraction)
+        for clip_id, model in models
+        if (fraction := _volume_fraction(model)) is not None
+    ]
+    if not any(abs(fraction) >= MIN_VOLUME_FRACTION for *_, fraction in volume_fractions):
         return undecided(rule, "no mesh encloses 1 % of its bounding box")
-    return finding(rule, [f"{clip_id}: {name}" for clip_id, name, share in shares if share < -LEAST_VOLUME], "warn")
+    return finding(
+        rule,
+        [f"{clip_id}: {name}" for clip_id, name, fraction in volume_fractions if fraction < -MIN_VOLUME_FRACTION],
+        "warn",
+    )
 
 
-def _volume_share(model: ObjectModel) -> float | None:
-    """Signed volume as a share of the bounding box; None of what is no mesh, which another rule finds."""
+def _volume_fraction(model: ObjectModel) -> float | None:
+    """Signed volume as a fraction of the bounding box; None for an invalid mesh, which another rule reports."""
     try:
         box_m3 = float(np.ptp(model.vertices_m, axis=0).prod())
         return float(volume_m3(model.vertices_m, model.faces)) / box_m3 if box_m3 > 0 else 0.0
@@ -210,6 +218,6 @@ def _both_hands(clips: list[Clip]) -> list[str]:
         if not any(clip.hands[side].valid.any() for clip in clips if side in clip.hands):
             problems.append(f"the {side} hand is valid in no frame")
     for clip in clips:
-        if np.any([track.valid for track in clip.hands.values()], axis=0).mean() < FEWEST_VALID:
+        if np.any([track.valid for track in clip.hands.values()], axis=0).mean() < MIN_VALID_FRACTION:
             problems.append(f"{clip.clip_id}: no hand is valid in most frames")
     return problems

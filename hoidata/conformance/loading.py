@@ -1,4 +1,4 @@
-"""Loading one sequence while watching which files are opened, and comparing two results field by field."""
+"""Loads one sequence while recording which files are opened, and compares two results field by field."""
 
 import os
 import sys
@@ -19,16 +19,13 @@ from hoidata.hands import HandPair
 
 @dataclass(frozen=True)
 class Loaded:
-    """What one sequence gave. error: what ``load`` raised instead. sources: what the RawTree recorded.
-
-    unrecorded: files below the root that were opened without it.
-    """
+    """Result of loading one sequence."""
 
     key: SequenceKey
     results: tuple[Any, ...]
-    sources: tuple[SourceFile, ...]
-    unrecorded: tuple[str, ...] = ()
-    error: Exception | None = None
+    sources: tuple[SourceFile, ...]  # recorded by the RawTree
+    unrecorded: tuple[str, ...] = ()  # files below the root that were opened without the RawTree
+    error: Exception | None = None  # raised by ``load``
 
     @property
     def clips(self) -> list[Clip]:
@@ -46,48 +43,57 @@ class Loaded:
 
     @property
     def needed(self) -> list[str]:
-        """Paths the clips name as their sources; those read when there are no clips."""
+        """Paths that the clips name as sources; without clips, all paths that were read."""
         named = {source.path for clip in self.clips for source in clip.sources}
         return sorted(named or {source.path for source in self.sources})
 
 
 def load_recorded(adapter: Adapter, root: Path, key: SequenceKey, hands: HandPair) -> Loaded:
-    """Load one sequence; errors of any kind are kept, for a check must go on."""
+    """Load one sequence. Any error is stored in the result so that the check continues."""
     raw = RawTree(root)
     results: tuple[Any, ...] = ()
     error: Exception | None = None
     with opened_files(root) as opened:
         try:
             results = tuple(adapter.load(raw, key, hands))
-        except Exception as raised:  # a defect of the adapter is what the check is looking for
+        except Exception as raised:  # the check reports defects of the adapter
             error = raised
     recorded = {source.path for source in raw.sources}
     unrecorded = tuple(sorted(path for path in opened if not {path, os.path.dirname(path)} & recorded))
     # An error may come before the file it is about was recorded.
-    return Loaded(key, _without_root(results, root), raw.sources, () if error else unrecorded, error)
+    return Loaded(
+        key=key,
+        results=_without_root(results, root),
+        sources=raw.sources,
+        unrecorded=() if error else unrecorded,
+        error=error,
+    )
 
 
-def first_difference(one: Any, other: Any, place: str = "") -> str | None:
-    """Where two values differ, bit by bit in arrays: ``object.rotvec``; None when they are equal."""
+def first_difference(one: Any, other: Any, path: str = "") -> str | None:
+    """Path of the first field in which two values differ, such as ``object.rotvec``; None if they are equal.
+
+    Arrays are compared bit by bit.
+    """
     if type(one) is not type(other):
-        return place or "the kind"
+        return path or "the kind"
     if isinstance(one, np.ndarray):
         same = one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
-        return None if same else place
+        return None if same else path
     if is_dataclass(one):
         pairs = [(item.name, getattr(one, item.name), getattr(other, item.name)) for item in fields(one)]
     elif isinstance(one, Mapping):
         if list(one) != list(other):
-            return place
+            return path
         pairs = [(str(key), one[key], other[key]) for key in one]
     elif isinstance(one, list | tuple):
         if len(one) != len(other):
-            return f"{place or 'the number of results'} ({len(one)} and {len(other)})"
+            return f"{path or 'the number of results'} ({len(one)} and {len(other)})"
         pairs = [(_name(item, number), item, other[number]) for number, item in enumerate(one)]
     else:
-        return None if one == other else place
-    found = (first_difference(a, b, f"{place}.{name}" if place else name) for name, a, b in pairs)
-    return next((item for item in found if item is not None), None)
+        return None if one == other else path
+    differences = (first_difference(a, b, f"{path}.{name}" if path else name) for name, a, b in pairs)
+    return next((item for item in differences if item is not None), None)
 
 
 @contextmanager
@@ -95,15 +101,15 @@ def opened_files(root: Path) -> Iterator[set[str]]:
     """Collect the paths, relative to ``root``, of the files below it that Python opens inside the block."""
     _install_hook()
     global _opened
-    before, _opened = _opened, []
+    outer, _opened = _opened, []
     result: set[str] = set()
     try:
         yield result
     finally:
-        opened, _opened = _opened, before
-        for place in (os.path.abspath(root), os.path.realpath(root)):
-            below = [path for path in opened if path.startswith(place + os.sep) and os.path.isfile(path)]
-            result |= {os.path.relpath(path, place) for path in below}
+        opened, _opened = _opened, outer
+        for root_path in (os.path.abspath(root), os.path.realpath(root)):
+            below = [path for path in opened if path.startswith(root_path + os.sep) and os.path.isfile(path)]
+            result |= {os.path.relpath(path, root_path) for path in below}
 
 
 _opened: list[str] | None = None
@@ -111,7 +117,7 @@ _opened: list[str] | None = None
 
 @cache
 def _install_hook() -> None:
-    """Audit hooks stay until the process ends: there is one, and it does nothing outside of ``opened_files``."""
+    """Install one audit hook, which Python cannot remove; it is idle outside of ``opened_files``."""
     sys.addaudithook(_note_open)
 
 
@@ -125,7 +131,7 @@ def _name(item: Any, number: int) -> str:
 
 
 def _without_root(results: tuple[Any, ...], root: Path) -> tuple[Any, ...]:
-    """Reasons with paths below the root, as conversion writes them, so that they can be compared between roots."""
+    """Remove the root from the paths in reasons, as conversion does, so that results of two roots are comparable."""
     prefix = f"{root}/"
     return tuple(
         Quarantined(*(getattr(item, field.name).replace(prefix, "") for field in fields(item)))

@@ -1,4 +1,4 @@
-"""One rule of the conformance check and how it came out."""
+"""Outcome of one rule of the conformance check."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,18 +9,15 @@ SHOWN = 3
 
 @dataclass(frozen=True)
 class Finding:
-    """rule: what must hold, as a sentence; outcome: detail: what was seen.
+    """A rule with its outcome."""
 
-    "warn": it looks wrong but may be right. "skip": it could not be tried on this input; ``detail`` says why.
-    """
-
-    rule: str
-    outcome: Literal["pass", "warn", "fail", "skip"]
-    detail: str = ""
+    rule: str  # as a sentence
+    outcome: Literal["pass", "warn", "fail", "skip"]  # warn: suspicious, may be right; skip: not testable on this input
+    detail: str = ""  # the first problems, or the reason for skipping
 
 
 def finding(rule: str, problems: Sequence[str], outcome: Literal["fail", "warn"] = "fail") -> Finding:
-    """Passed when there are no problems, else ``outcome`` with the first of them."""
+    """Outcome "pass" without problems, else ``outcome`` with the first problems."""
     if not problems:
         return Finding(rule, "pass")
     rest = len(problems) - SHOWN
@@ -28,9 +25,10 @@ def finding(rule: str, problems: Sequence[str], outcome: Literal["fail", "warn"]
 
 
 def skipped(rule: str, why: str) -> Finding:
+    """The rule was not tried."""
     return Finding(rule, "skip", why)
 
 
 def undecided(rule: str, why: str) -> Finding:
-    """There is too little in the input for a verdict, good or bad."""
+    """The input has too little data for a verdict."""
     return Finding(rule, "skip", f"not decided: {why}")

@@ -1,8 +1,8 @@
-"""Whether the hands of clips are hands that hold something: what a wrong convention shows, measured.
+"""Detects wrong conventions by measuring hands against the object.
 
-A wrong unit, mean pose, translation or transposed rotation leaves every array valid, but the fingertips miss the
-object, fingers bend backwards, or the object turns against the hand. Where another reading of the same numbers fits
-much better, that reading is named.
+With a wrong unit, mean pose, translation or transposed rotation every array is still valid. But fingertips miss the
+object, fingers bend backwards, or the object rotates against the hand. If another interpretation of the same numbers
+fits much better, the finding names it.
 """
 
 from collections.abc import Callable
@@ -16,63 +16,65 @@ from hoidata.geometry.rotations import rotation_angle, rotvec_to_rotmat
 from hoidata.hands import HandModel, HandPair, track_joints
 from hoidata.objects.distance import closest_points
 
-MOST_CLIPS, MOST_FRAMES = 12, 24
+MAX_CLIPS, MAX_FRAMES_PER_CLIP = 12, 24
 HAND_LENGTH_M = (0.15, 0.25)
 TOUCH_M, WRIST_M = 0.02, 0.30
-FAR_M = 0.05
-MOST = 0.6
-MUCH_BETTER = 0.65
-LEAST_TURN_RAD = np.deg2rad(0.5)
-# One clip shows one object in nearly one pose: a wrong reading may fit it by chance. At most 24 frames of each count.
-FEWEST_FRAMES = 40
+MAX_TIP_DISTANCE_M = 0.05
+MIN_CLIP_FRACTION = 0.6
+MAX_BETTER_RATIO = 0.65
+MIN_ROTATION_RAD = np.deg2rad(0.5)
+# One clip has one object in nearly one pose, which a wrong interpretation may fit by chance.
+MIN_FRAMES = 40
 MIDDLE_FINGER = (0, 4, 5, 6, 17)
 FIRST_TIP = 16
-FINGERS = (1, 4, 7, 10)  # first joints of index, middle, pinky, ring
+FIRST_FINGER_JOINTS = (1, 4, 7, 10)  # first joints of index, middle, pinky, ring
 
 Reading = Callable[[Clip, HandPair], Clip]
 
 
 @dataclass(frozen=True)
 class _Touch:
-    """Metres from the object (side, frame), NaN if not valid: wrist, mean of the three nearest tips, nearest tip."""
+    """Distances from the object's surface, (side, frame); NaN for invalid hands."""
 
     wrist_m: np.ndarray
-    tips_m: np.ndarray
+    tips_m: np.ndarray  # mean of the three closest fingertips
     nearest_tip_m: np.ndarray
 
 
 def touch_findings(clips: list[Clip], hands: HandPair) -> list[Finding]:
-    """Rules over at most 24 frames of 12 clips, all warnings: data of an unusual kind may break them rightly.
+    """Measure at most 24 frames of each of 12 clips. All rules only warn, because unusual data may break them.
 
-    Fewer than 40 frames in which the rule can look at a hand decide nothing, but for the length of hands.
+    Rules other than the hand length need at least 40 frames with a hand.
     """
-    some = [clips[i].take(_spread(clips[i].n_frames, MOST_FRAMES)) for i in _spread(len(clips), MOST_CLIPS)]
+    sampled_clips = [
+        clips[i].take(_spread(clips[i].n_frames, MAX_FRAMES_PER_CLIP)) for i in _spread(len(clips), MAX_CLIPS)
+    ]
     try:
-        touches = [_touch(clip, hands) for clip in some]
+        touches = [_touch(clip, hands) for clip in sampled_clips]
     except Exception as error:  # arrays that check_clip refused, and which another rule reports
-        return [skipped("hands hold objects", f"the clips cannot be measured: {error!r}")]
+        return [skipped("hands touch the object", f"the clips cannot be measured: {error!r}")]
     return [
-        _hand_lengths(some, hands),
-        _near(
-            "wrists are within 0.3 m of the object when it is nearest",
+        _hand_lengths(sampled_clips, hands),
+        _is_near(
+            "wrists are within 0.3 m of the object when closest",
             [touch.wrist_m for touch in touches],
             WRIST_M,
             "unit, frame or translation?",
         ),
-        _near(
+        _is_near(
             "a fingertip comes within 2 cm of the object in most clips",
             [touch.nearest_tip_m for touch in touches],
             TOUCH_M,
             "mean pose, frame or parts?",
         ),
-        _bending(some, hands),
-        _other_readings(some, touches, hands),
-        _turning(some, touches),
+        _bending(sampled_clips, hands),
+        _alternative_readings(sampled_clips, touches, hands),
+        _rotates_with_hand(sampled_clips, touches),
     ]
 
 
 def _spread(length: int, most: int) -> np.ndarray:
-    """At most so many numbers below ``length``, evenly spread."""
+    """At most ``most`` evenly spread indices below ``length``."""
     return np.unique(np.linspace(0, length - 1, most).astype(int))
 
 
@@ -90,23 +92,23 @@ def _touch(clip: Clip, hands: HandPair) -> _Touch:
 
 
 def _distances(clip: Clip, points_m: np.ndarray) -> np.ndarray:
-    """(frame, point) distance of world points from the object's surface, each part where its hinge has moved it."""
+    """Distance of world points from the object's surface, with its parts posed by the hinge. Returns (frame, point)."""
     track, model = clip.object, clip.object.model
     local = track.world_from_object.inverse() @ points_m
     nearest = np.full(local.shape[:2], np.inf)
     for part in model.parts:
         in_part = model.object_from_part(part, track.hinge_rad).inverse() @ local
-        found = closest_points(model.vertices_m, model.faces_of(part), in_part.reshape(-1, 3)).distance_m
-        nearest = np.minimum(nearest, found.reshape(nearest.shape))
+        distance_m = closest_points(model.vertices_m, model.faces_of(part), in_part.reshape(-1, 3)).distance_m
+        nearest = np.minimum(nearest, distance_m.reshape(nearest.shape))
     return nearest
 
 
-def _too_few(rule: str, what: str, n_frames: int) -> Finding | None:
-    """That a rule is not decided where it rests on fewer than 40 frames. what: which frames count."""
-    if n_frames >= FEWEST_FRAMES:
+def _too_few(rule: str, frames_in_words: str, n_frames: int) -> Finding | None:
+    """The finding "undecided" below 40 frames, else None. frames_in_words: which frames count."""
+    if n_frames >= MIN_FRAMES:
         return None
-    remedy = f"{FEWEST_FRAMES} are needed, at most {MOST_FRAMES} of each clip count: load more sequences"
-    return undecided(rule, f"{n_frames} frames {what}; {remedy}")
+    remedy = f"{MIN_FRAMES} are needed, at most {MAX_FRAMES_PER_CLIP} of each clip count: load more sequences"
+    return undecided(rule, f"{n_frames} frames {frames_in_words}; {remedy}")
 
 
 def _hand_lengths(clips: list[Clip], hands: HandPair) -> Finding:
@@ -121,7 +123,7 @@ def _hand_lengths(clips: list[Clip], hands: HandPair) -> Finding:
 
 
 def _hand_length_m(clip: Clip, side: Side, hands: HandPair) -> float | None:
-    """Bone by bone from the wrist to the middle fingertip, in the first valid frame."""
+    """Sum of bone lengths from wrist to middle fingertip, in the first valid frame; None if there is none."""
     track = clip.hands[side]
     if not track.valid.any():
         return None
@@ -129,19 +131,19 @@ def _hand_length_m(clip: Clip, side: Side, hands: HandPair) -> float | None:
     return float(np.linalg.norm(np.diff(joints[list(MIDDLE_FINGER)], axis=0), axis=1).sum())
 
 
-def _near(rule: str, distances_m: list[np.ndarray], limit_m: float, question: str) -> Finding:
-    """Whether the smallest distance of most clips is within the limit."""
+def _is_near(rule: str, distances_m: list[np.ndarray], limit_m: float, question: str) -> Finding:
+    """Whether most clips have a smallest distance within the limit. distances_m: per clip (side, frame)."""
     n_frames = sum(int(np.isfinite(distance).any(axis=0).sum()) for distance in distances_m)
     if few := _too_few(rule, "with a hand", n_frames):
         return few
     nearest = [distance[np.isfinite(distance)].min(initial=np.inf) for distance in distances_m]
-    share = np.mean([value <= limit_m for value in nearest])
-    text = f"only in {share:.0%} of clips; typically {np.median(nearest) * 100:.2g} cm: {question}"
-    return finding(rule, [] if share >= MOST else [text], "warn")
+    near_fraction = np.mean([value <= limit_m for value in nearest])
+    problem = f"only in {near_fraction:.0%} of clips; typically {np.median(nearest) * 100:.2g} cm: {question}"
+    return finding(rule, [] if near_fraction >= MIN_CLIP_FRACTION else [problem], "warn")
 
 
 def _bending(clips: list[Clip], hands: HandPair) -> Finding:
-    """Fingers flex towards the palm; exchanged or mirrored sides bend them backwards."""
+    """Fingers flex towards the palm. If sides are swapped or mirrored, they bend backwards."""
     rule, problems = "fingers bend towards the palm: a left hand is a left hand", []
     n_frames = sum(int(track.valid.sum()) for clip in clips for track in clip.hands.values())
     if few := _too_few(rule, "of hands", n_frames):
@@ -155,12 +157,12 @@ def _bending(clips: list[Clip], hands: HandPair) -> Finding:
 
 
 def _flexion_rad(clip: Clip, side: Side, hands: HandPair) -> float:
-    """Mean angle of the four fingers' middle joints, positive towards the palm."""
+    """Mean flexion of the middle joints of four fingers, positive towards the palm."""
     track = clip.hands[side]
     joints = track_joints(track, hands[side]).astype(np.float64)[track.valid]
     palm = np.cross(joints[:, 1] - joints[:, 0], joints[:, 7] - joints[:, 0]) * (1 if side == "right" else -1)
     angles = []
-    for first in FINGERS:
+    for first in FIRST_FINGER_JOINTS:
         along, after = joints[:, first + 1] - joints[:, first], joints[:, first + 2] - joints[:, first + 1]
         along = along / np.linalg.norm(along, axis=1, keepdims=True)
         across = palm - (palm * along).sum(axis=1, keepdims=True) * along
@@ -169,60 +171,73 @@ def _flexion_rad(clip: Clip, side: Side, hands: HandPair) -> float:
     return float(np.mean(angles))
 
 
-def _other_readings(clips: list[Clip], touches: list[_Touch], hands: HandPair) -> Finding:
-    """Whether fingertips are much nearer the object when the same numbers are read in another way."""
-    rule, problems = "no other reading of the numbers brings the fingertips nearer", []
+def _alternative_readings(clips: list[Clip], touches: list[_Touch], hands: HandPair) -> Finding:
+    """Whether another interpretation of the same numbers brings the fingertips much closer to the object."""
+    rule, problems = "no other interpretation of the numbers brings the fingertips closer", []
     n_frames = sum(int(np.isfinite(touch.tips_m).any(axis=0).sum()) for touch in touches)
     if few := _too_few(rule, "with a hand", n_frames):
         return few
-    for what, reading in READINGS.items():
+    for reading_in_words, reading in READINGS.items():
         pairs = [
             _paired(touch, _touch(reading(clip, hands), hands)) for clip, touch in zip(clips, touches, strict=True)
         ]
-        as_is, other = np.mean(pairs, axis=0)
-        agrees = [theirs < MUCH_BETTER * ours for ours, theirs in pairs if ours or theirs]
-        if other < MUCH_BETTER * as_is and sum(agrees) > 1:  # what one clip alone says may be chance
-            problems.append(f"{other * 1e3:.0f} mm in place of {as_is * 1e3:.0f} mm {what}")
+        as_read_m, alternative_m = np.mean(pairs, axis=0)
+        agrees = [alternative < MAX_BETTER_RATIO * as_read for as_read, alternative in pairs if as_read or alternative]
+        if alternative_m < MAX_BETTER_RATIO * as_read_m and sum(agrees) > 1:  # a single clip may agree by chance
+            problems.append(f"{alternative_m * 1e3:.0f} mm in place of {as_read_m * 1e3:.0f} mm {reading_in_words}")
     return finding(rule, problems, "warn")
 
 
 def _paired(touch: _Touch, other: _Touch) -> tuple[float, float]:
-    """Mean tip distances under two readings, over the frames in which a hand is at the object under either."""
-    ours, theirs = (np.fmin.reduce([*t.tips_m, np.full(t.tips_m.shape[1], FAR_M)]) for t in (touch, other))
-    held = np.minimum(ours, theirs) < TOUCH_M
-    return (float(ours[held].mean()), float(theirs[held].mean())) if held.any() else (0.0, 0.0)
-
-
-def _turning(clips: list[Clip], touches: list[_Touch]) -> Finding:
-    """A held object turns as the hand does; with transposed rotations it turns the other way."""
-    rule = "held objects turn with the hand"
-    steps = [_turns(clip, touch) for clip, touch in zip(clips, touches, strict=True)]
-    turning = [step[step[:, 2] > LEAST_TURN_RAD] for step in steps]
-    told = np.concatenate(turning)
-    if len(told) < MOST_FRAMES // 2 or sum(len(step) > 0 for step in turning) < 2:
-        n_clips = sum(len(step) > 0 for step in turning)
-        return undecided(rule, f"held objects turn in {len(told)} steps of {n_clips} clips: load more sequences")
-    as_is, transposed = np.rad2deg(told[:, :2].mean(axis=0))
-    if transposed >= MUCH_BETTER * as_is:
-        return finding(rule, [])
-    text = (
-        f"they differ by {as_is:.1f} degrees per step, transposed by {transposed:.1f}: row vectors taken for columns?"
+    """Mean tip distances of two interpretations, over frames in which a hand touches the object in either."""
+    as_read_m, alternative_m = (
+        np.fmin.reduce([*t.tips_m, np.full(t.tips_m.shape[1], MAX_TIP_DISTANCE_M)]) for t in (touch, other)
     )
-    return finding(rule, [text], "warn")
+    at_object = np.minimum(as_read_m, alternative_m) < TOUCH_M
+    return (
+        (float(as_read_m[at_object].mean()), float(alternative_m[at_object].mean())) if at_object.any() else (0.0, 0.0)
+    )
 
 
-def _turns(clip: Clip, touch: _Touch) -> np.ndarray:
-    """(step, 3) radians: hand against object, hand against the transposed object, and the object's own turn."""
-    thing = rotvec_to_rotmat(clip.object.rotvec.astype(np.float64))
+def _rotates_with_hand(clips: list[Clip], touches: list[_Touch]) -> Finding:
+    """A grasped object rotates with the hand; with transposed rotations it rotates the other way."""
+    rule = "grasped objects rotate with the hand"
+    steps = [_rotation_steps(clip, touch) for clip, touch in zip(clips, touches, strict=True)]
+    turning = [step[step[:, 2] > MIN_ROTATION_RAD] for step in steps]
+    rotating_steps = np.concatenate(turning)
+    if len(rotating_steps) < MAX_FRAMES_PER_CLIP // 2 or sum(len(step) > 0 for step in turning) < 2:
+        n_clips = sum(len(step) > 0 for step in turning)
+        return undecided(
+            rule, f"grasped objects rotate in {len(rotating_steps)} steps of {n_clips} clips: load more sequences"
+        )
+    as_read_deg, transposed_deg = np.rad2deg(rotating_steps[:, :2].mean(axis=0))
+    if transposed_deg >= MAX_BETTER_RATIO * as_read_deg:
+        return finding(rule, [])
+    degrees = f"{as_read_deg:.1f} degrees per step, transposed by {transposed_deg:.1f}"
+    return finding(rule, [f"they differ by {degrees}: row vectors taken for columns?"], "warn")
+
+
+def _rotation_steps(clip: Clip, touch: _Touch) -> np.ndarray:
+    """Rotations between consecutive frames in which a fingertip touches the object.
+
+    Returns:
+        (step, 3) angles in radians: between hand and object rotation, between hand and transposed object rotation, and
+        of the object rotation alone.
+    """
+    object_rotmat = rotvec_to_rotmat(clip.object.rotvec.astype(np.float64))
     steps = []
     for number, side in enumerate(SIDES):
-        hand = rotvec_to_rotmat(clip.hands[side].global_orient.astype(np.float64))
-        held = np.nan_to_num(touch.nearest_tip_m[number], nan=np.inf) < TOUCH_M
-        pairs = np.flatnonzero(held[1:] & held[:-1])
-        hand_turn = hand[pairs + 1] @ hand[pairs].transpose(0, 2, 1)
-        turn = thing[pairs + 1] @ thing[pairs].transpose(0, 2, 1)
-        turn_transposed = thing[pairs + 1].transpose(0, 2, 1) @ thing[pairs]
-        columns = (turn.transpose(0, 2, 1) @ hand_turn, turn_transposed.transpose(0, 2, 1) @ hand_turn, turn)
+        hand_rotmat = rotvec_to_rotmat(clip.hands[side].global_orient.astype(np.float64))
+        at_object = np.nan_to_num(touch.nearest_tip_m[number], nan=np.inf) < TOUCH_M
+        pairs = np.flatnonzero(at_object[1:] & at_object[:-1])
+        hand_rotation = hand_rotmat[pairs + 1] @ hand_rotmat[pairs].transpose(0, 2, 1)
+        object_rotation = object_rotmat[pairs + 1] @ object_rotmat[pairs].transpose(0, 2, 1)
+        transposed_rotation = object_rotmat[pairs + 1].transpose(0, 2, 1) @ object_rotmat[pairs]
+        columns = (
+            object_rotation.transpose(0, 2, 1) @ hand_rotation,
+            transposed_rotation.transpose(0, 2, 1) @ hand_rotation,
+            object_rotation,
+        )
         steps.append(np.stack([rotation_angle(column) for column in columns], axis=1))
     return np.concatenate(steps)
 

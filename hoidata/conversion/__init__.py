@@ -1,1 +1,1 @@
-"""Raw files of one dataset to a clip store, by its adapter, in processes that may be killed."""
+"""Converts the raw files of one dataset to a clip store, in worker processes; resumes after a kill."""

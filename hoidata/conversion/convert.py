@@ -1,8 +1,8 @@
-"""One dataset from raw files to the store: every sequence converts or is listed with its reason.
+"""Converts one dataset from raw files to the store: every sequence gives clips or a reason.
 
-Each sequence's results are kept as soon as they are made (``finished``); when all are there, they become the store in
-the order of the keys. So a run that was killed goes on where it was, at most one sequence per worker is in memory, and
-the bytes depend neither on the number of workers nor on how often the run was killed.
+Workers save the results of each finished sequence (``finished``). The parent process then writes the store in the order
+of the keys. So a killed run resumes, and at most one sequence per worker is in memory. The bytes depend neither on the
+number of workers nor on interruptions.
 """
 
 import sys
@@ -18,8 +18,8 @@ from hoidata.clips.clip import Clip, SourceFile
 from hoidata.clips.hand_parameters import hands_for
 from hoidata.clips.quarantine import Quarantined
 from hoidata.clips.validation import check_clip
-from hoidata.conversion.finished import FinishedWork, Item, job_of
-from hoidata.datasets.base import Adapter, RawTree, Recorded, SequenceKey
+from hoidata.conversion.finished import FinishedWork, Item, job_description
+from hoidata.datasets.base import Adapter, HasHandRecordings, RawTree, SequenceKey
 from hoidata.errors import BadInput, ChangedMeanwhile
 from hoidata.files.atomic import exclusive, remove_leftovers
 from hoidata.hands import HandPair
@@ -33,29 +33,25 @@ GENERATED_LICENCE = "CC0-1.0"
 
 @dataclass(frozen=True)
 class ConversionSummary:
-    """What a conversion did.
-
-    left_out: every sequence, or stretch of one, that gave no clip, with its reason. taken_up: sequences an interrupted
-    run had finished before. warning: what is wrong with every clip, or "".
-    """
+    """Counts and problems of one conversion."""
 
     dataset: str
-    sequences: int
+    sequences: int  # number of sequences in the raw folder
     clips: int
     frames: int
-    left_out: tuple[Quarantined, ...]
-    empty_reason: str | None = None
-    taken_up: int = 0
-    warning: str = ""
+    quarantined: tuple[Quarantined, ...]  # sequences and intervals without a clip, with the reason
+    empty_reason: str | None = None  # why the store is empty
+    resumed: int = 0  # number of sequences that an interrupted run had finished
+    warning: str = ""  # a problem of every clip
 
     def __str__(self) -> str:
         if self.empty_reason:
             return f"{self.dataset}: empty ({self.empty_reason})"
         head = f"{self.dataset}: {self.clips} clips, {self.frames} frames from {self.sequences} sequences"
-        head += f" ({self.taken_up} finished before)" if self.taken_up else ""
+        head += f" ({self.resumed} finished before)" if self.resumed else ""
         lines = [f"warning: {self.warning}"] if self.warning else []
-        lines.append(f"{head}; {len(self.left_out)} left out{':' if self.left_out else ''}")
-        for item in self.left_out:
+        lines.append(f"{head}; {len(self.quarantined)} quarantined{':' if self.quarantined else ''}")
+        for item in self.quarantined:
             lines.append(f"  {item.source_key}: {item.where}: expected {item.expected}, got {item.got}; {item.remedy}")
         return "\n".join(lines)
 
@@ -73,22 +69,30 @@ def convert_dataset(
 ) -> ConversionSummary:
     """Convert every sequence below ``root`` and write the store ``out``.
 
-    root: None, or a folder without sequences, gives a valid empty store that says why. jobs: worker processes; order
-    and bytes of the result do not depend on it. manifest: each file read must be listed with its SHA-256.
-    stop_on_change: raise ChangedMeanwhile for a listed file that is gone or another; by default its sequences are
-    left out. synthetic: the raw data was generated; every clip and the store say so. progress: a bar on stderr and the
-    summary on stdout.
+    An interrupted run leaves ``.<name>.work`` next to ``out``. The next run reuses its finished sequences if raw files,
+    code and settings are unchanged. A sequence is quarantined if its worker process dies, and dies again in a process
+    without other sequences. Resumed runs do not try it again; the next conversion does.
 
-    A run that ends early, even by ``kill -9``, leaves ``.<name>.work`` beside ``out``; the next one takes up what was
-    finished there if neither raw files, code nor settings have changed. A sequence whose worker process dies, and dies
-    again when it is tried alone, is left out; it stays so until the store is finished, and a later conversion tries
-    it anew. Raises BadInput when ``out`` is being written by another run, or when there is no room.
+    Args:
+        adapter: reads the raw files.
+        root: the raw folder. None, or a folder without sequences, gives an empty store with the reason.
+        hands: hand models of both sides.
+        out: folder of the store.
+        jobs: number of worker processes; order and bytes of the result do not depend on it.
+        manifest: if given, every file read must be listed with its SHA-256.
+        progress: show a progress bar on stderr and the summary on stdout.
+        synthetic: the raw data is generated; every clip and the store are marked.
+        stop_on_change: raise for a listed file that is missing or changed. By default its sequences are quarantined.
+
+    Raises:
+        BadInput: another run writes ``out``, or the disk is full.
+        ChangedMeanwhile: see ``stop_on_change``.
     """
     hands = hands_for(adapter.hand_convention, hands)
-    found = adapter.sequences(Path(root)) if root is not None and Path(root).is_dir() else []
-    keys = [key for key in found if _is_utf_8(str(key))]
-    unnamed = [_without_a_name(key) for key in found if key not in keys]
-    reason = None if keys else _why_empty(adapter, root)
+    all_keys = adapter.sequences(Path(root)) if root is not None and Path(root).is_dir() else []
+    keys = [key for key in all_keys if _is_utf_8(str(key))]
+    undecodable = [_undecodable_name(key) for key in all_keys if key not in keys]
+    empty_reason = None if keys else _empty_reason(adapter, root)
     files = manifest.values() if isinstance(manifest, Mapping) else manifest
     listed = None if files is None else {item.path: item for item in files}
     out, root = Path(out), Path(root or ".")
@@ -96,20 +100,35 @@ def convert_dataset(
         got, remedy = f"{len(gone)} gone, first {gone[0]}", "restore the files, or scan the raw folder again"
         raise ChangedMeanwhile(root, "all files that are listed", got, remedy)
     work = FinishedWork(out.with_name(f".{out.name}.work"), root)
-    convert = SequenceConverter(adapter, root, hands, listed, synthetic, work, stop_on_change)
+    convert = SequenceConverter(
+        adapter=adapter,
+        root=root,
+        hands=hands,
+        manifest=listed,
+        synthetic=synthetic,
+        work=work,
+        stop_on_change=stop_on_change,
+    )
     with exclusive(out) as lock:
         remove_leftovers(out)
-        work.open(job_of(adapter, hands, root, keys, listed, synthetic))
-        taken_up = _convert_all(convert, keys, jobs, lock, progress)
-        items = chain(unnamed, (item for key in keys for item in work.read(key)))
-        info = _store_info(adapter, hands, synthetic, reason)
+        work.open(job_description(adapter, hands, root, keys, listed, synthetic))
+        resumed = _convert_all(convert, keys, jobs, lock, progress)
+        items = chain(undecodable, (item for key in keys for item in work.read(key)))
+        info = _store_info(adapter, hands, synthetic, empty_reason)
         counts = write_store(out, items, info)
         work.remove()
-        # Read back: the store leaves out clips of its own accord, too (an id that is given twice).
-        left_out = tuple(Quarantined(**row) for row in open_store(out).quarantine.to_dict("records"))
+        # Read back, because writing the store also quarantines clips, such as one with a duplicate id.
+        quarantined = tuple(Quarantined(**row) for row in open_store(out).quarantine.to_dict("records"))
     warning = stand_in_note(info) if counts["clips"] else ""
     summary = ConversionSummary(
-        adapter.name, len(found), counts["clips"], counts["frames"], left_out, reason, taken_up, warning
+        dataset=adapter.name,
+        sequences=len(all_keys),
+        clips=counts["clips"],
+        frames=counts["frames"],
+        quarantined=quarantined,
+        empty_reason=empty_reason,
+        resumed=resumed,
+        warning=warning,
     )
     if progress:
         print(summary, file=sys.stdout)
@@ -118,7 +137,7 @@ def convert_dataset(
 
 @dataclass(frozen=True)
 class SequenceConverter:
-    """What a worker needs: called with a key, it leaves that sequence's results in ``work``."""
+    """Converts one sequence in a worker process and saves its results in ``work``."""
 
     adapter: Adapter
     root: Path
@@ -135,61 +154,62 @@ class SequenceConverter:
                 item if isinstance(item, Quarantined) else check_clip(replace(item, synthetic=self.synthetic))
                 for item in self.adapter.load(raw, key, self.hands)
             ]
-            if isinstance(self.adapter, Recorded) and any(isinstance(item, Clip) for item in results):
+            if isinstance(self.adapter, HasHandRecordings) and any(isinstance(item, Clip) for item in results):
                 results += self.adapter.recordings(raw, key)
         except BadInput as error:
             if self.stop_on_change and isinstance(error, ChangedMeanwhile):
                 raise
-            self.work.keep(key, [_left_out(key, self.root, error)], None)
-        except Exception as error:  # one sequence must not stop the others; the reason says that this is our fault
+            self.work.save(key, [_quarantined(key, self.root, error)], None)
+        except Exception as error:  # one sequence must not stop the others; the reason blames hoidata
             problem = BadInput(str(key), "a sequence the adapter can read", repr(error), DEFECT)
-            self.work.keep(key, [_left_out(key, self.root, problem)], None)
+            self.work.save(key, [_quarantined(key, self.root, problem)], None)
         else:
-            self.work.keep(key, results, raw.sources)
+            self.work.save(key, results, raw.sources)
 
-    def leave_out(self, lost: WorkerLost) -> None:
-        """Keep the reason in the place of the clips; a run that goes on does not try it again."""
-        self.work.keep(lost.item, [_left_out(lost.item, self.root, lost)], ())
+    def quarantine(self, lost: WorkerLost) -> None:
+        """Save the reason as the sequence's result; a resumed run does not try the sequence again."""
+        self.work.save(lost.item, [_quarantined(lost.item, self.root, lost)], ())
 
 
 def _convert_all(convert: SequenceConverter, keys: Sequence[SequenceKey], jobs: int, lock: int, progress: bool) -> int:
-    """Convert every sequence that was not finished before; how many were."""
-    missing = [key for key in keys if not convert.work.holds(key)]
-    taken_up = len(keys) - len(missing)
-    title = f"convert {convert.adapter.name}" + (f" ({taken_up} finished before)" if taken_up else "")
+    """Convert the unfinished sequences. Returns how many were finished before."""
+    missing = [key for key in keys if not convert.work.is_finished(key)]
+    resumed = len(keys) - len(missing)
+    title = f"convert {convert.adapter.name}" + (f" ({resumed} finished before)" if resumed else "")
     with Progress(console=Console(stderr=True), disable=not progress) as bar:
-        task = bar.add_task(title, total=len(keys), completed=taken_up)
-        for _ in in_workers(convert, missing, jobs, lock, convert.leave_out):
+        task = bar.add_task(title, total=len(keys), completed=resumed)
+        for _ in in_workers(convert, missing, jobs, lock, convert.quarantine):
             bar.advance(task)
-    return taken_up
+    return resumed
 
 
-def _left_out(key: SequenceKey, root: Path, error: BadInput) -> Quarantined:
-    """The error with paths below the raw root, so that the store does not depend on where the raw data lies."""
+def _quarantined(key: SequenceKey, root: Path, error: BadInput) -> Quarantined:
+    """The error with paths relative to the raw root, so that the store does not depend on the root."""
     prefix = f"{root}/"
-    where, got = error.where.replace(prefix, ""), error.got.replace(prefix, "")
-    return Quarantined(str(key), where, error.expected.replace(prefix, ""), got, error.remedy)
+    location, got = error.where.replace(prefix, ""), error.got.replace(prefix, "")
+    expected = error.expected.replace(prefix, "")
+    return Quarantined(str(key), where=location, expected=expected, got=got, remedy=error.remedy)
 
 
 def _is_utf_8(text: str) -> bool:
     return text == text.encode(errors="replace").decode()
 
 
-def _without_a_name(key: SequenceKey) -> Quarantined:
-    """A sequence whose file has a name that no id, table or manifest can hold."""
+def _undecodable_name(key: SequenceKey) -> Quarantined:
+    """The reason for a sequence whose file name is not UTF-8, which ids, tables and manifests require."""
     shown = str(key).encode(errors="backslashreplace").decode()
-    return Quarantined(shown, shown, "a file name in UTF-8", "other bytes", "rename it")
+    return Quarantined(shown, where=shown, expected="a file name in UTF-8", got="other bytes", remedy="rename it")
 
 
-def _why_empty(adapter: Adapter, root: str | Path | None) -> str:
+def _empty_reason(adapter: Adapter, root: str | Path | None) -> str:
     if root is None:
         return f"no raw folder was given; register at {adapter.where_to_register}"
-    what = "has no sequences" if Path(root).is_dir() else "does not exist"
-    return f"the raw folder {Path(root).name} {what}; register at {adapter.where_to_register}"
+    problem = "has no sequences" if Path(root).is_dir() else "does not exist"
+    return f"the raw folder {Path(root).name} {problem}; register at {adapter.where_to_register}"
 
 
 def _store_info(adapter: Adapter, hands: HandPair, synthetic: bool, reason: str | None) -> dict[str, object]:
-    of_arrays = {} if synthetic else getattr(adapter, "licences", {})
+    array_licences = {} if synthetic else getattr(adapter, "licences", {})
     return store_info(
         adapter.name,
         hands,
@@ -202,5 +222,5 @@ def _store_info(adapter: Adapter, hands: HandPair, synthetic: bool, reason: str 
         synthetic=synthetic,
         where_to_register=adapter.where_to_register,
         empty_reason=reason,
-        **({"licences": of_arrays} if of_arrays else {}),
+        **({"licences": array_licences} if array_licences else {}),
     )

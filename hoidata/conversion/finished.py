@@ -1,12 +1,12 @@
-"""Finished sequences of a conversion, kept beside the store until it is whole, so that a killed run can go on.
+"""Saves the finished sequences of a conversion next to the store until it is complete, so that a killed run resumes.
 
-    .clips.work/job.json             what decides every result: adapter and settings, hands, schema, code, libraries
-    .clips.work/sequences/<key>.npz  sources (their state when they were read), results and data (see ``Packer``)
-    .clips.work/shared/<sha256>.npz  one mesh or hand template, however many sequences have it
+    .clips.work/job.json             everything that determines the results: adapter, settings, hands, schema, code
+    .clips.work/sequences/<key>.npz  state of the source files when they were read, results and data (see ``Packer``)
+    .clips.work/shared/<sha256>.npz  a mesh or hand template that several sequences may share
 
-Every file appears whole or not at all, written by the worker that made it: results never pass between processes.
-Results are kept as JSON values and arrays, exact in every bit, no pickles: a dataclass becomes ``{"kind": name,
-"fields": ...}``, an array its dtype, shape and place in one block of bytes.
+Workers write each file atomically; results never pass between processes. Results are JSON values and arrays, exact in
+every bit, without pickles. A dataclass becomes ``{"kind": name, "fields": ...}``, and an array its dtype, shape and
+offset in one block of bytes.
 """
 
 import inspect
@@ -49,24 +49,22 @@ _ALIGNMENT = 16
 
 
 class Packer:
-    """Turns values into JSON; their arrays pile up in ``blocks``.
+    """Converts values to JSON and collects their arrays in ``blocks``."""
 
-    share: keeps an array elsewhere and gives the name it is found under.
-    """
-
-    def __init__(self, share: Callable[[np.ndarray], str]) -> None:
-        self.share = share
+    def __init__(self, store_shared: Callable[[np.ndarray], str]) -> None:
+        """store_shared: stores an array outside of ``blocks`` and returns its name."""
+        self.store_shared = store_shared
         self.blocks: list[bytes] = []
         self._length = 0
         self._shared: dict[int, tuple[np.ndarray, str]] = {}
 
     @property
     def shared(self) -> set[str]:
-        """The names of the arrays kept elsewhere."""
+        """The names of the arrays stored outside of ``blocks``."""
         return {name for _, name in self._shared.values()}
 
     def pack(self, value: Any) -> Any:
-        """``value`` as JSON values. Raises TypeError for anything but the parts clips are made of."""
+        """``value`` as JSON values. Raises TypeError for types that clips do not contain."""
         if value is None or isinstance(value, bool | int | str) or type(value) is float:
             return value
         if isinstance(value, np.ndarray | np.generic):
@@ -84,24 +82,30 @@ class Packer:
         value = getattr(owner, name)
         if (kind, name) not in SHARED or value is None:
             return self.pack(value)
-        # Clips of one sequence share one array object: it is digested once. Held here, so that no other gets its id.
+        # Clips of one sequence share one array object, which is digested once. The reference keeps its id unique.
         if id(value) not in self._shared:
-            self._shared[id(value)] = value, self.share(value)
+            self._shared[id(value)] = value, self.store_shared(value)
         return {"shared": self._shared[id(value)][1]}
 
     def _keep(self, array: np.ndarray) -> list[Any]:
         if array.dtype.hasobject:
             raise TypeError("an array of Python objects cannot be part of a clip")
         data = array.tobytes()
-        place, self._length = self._length, self._length + len(data) + -len(data) % _ALIGNMENT
+        offset, self._length = self._length, self._length + len(data) + -len(data) % _ALIGNMENT
         self.blocks.append(data + bytes(-len(data) % _ALIGNMENT))
-        return [array.dtype.str, list(array.shape), place]
+        return [array.dtype.str, list(array.shape), offset]
 
 
 def unpack(value: Any, data: np.ndarray, shared: Callable[[str], np.ndarray]) -> Any:
-    """What ``Packer.pack`` was given. data: (byte,) uint8, its blocks joined; shared: an array by its name.
+    """The inverse of ``Packer.pack``.
 
-    Raises KeyError, TypeError or ValueError for anything else.
+    Args:
+        value: returned by ``Packer.pack``.
+        data: (byte,) uint8, the packer's blocks joined.
+        shared: loads a shared array by its name.
+
+    Raises:
+        KeyError, TypeError, ValueError: ``value`` is not from ``Packer.pack``.
     """
     if not isinstance(value, dict):
         return value
@@ -118,19 +122,30 @@ def unpack(value: Any, data: np.ndarray, shared: Callable[[str], np.ndarray]) ->
     return tuple(items) if "tuple" in value else items
 
 
-def _array(facts: list[Any], data: np.ndarray) -> np.ndarray:
-    dtype, shape, place = np.dtype(facts[0]), facts[1], facts[2]
+def _array(stored: list[Any], data: np.ndarray) -> np.ndarray:
+    dtype, shape, offset = np.dtype(stored[0]), stored[1], stored[2]
     if dtype.hasobject:
         raise ValueError("an array of Python objects")
     count = int(np.prod(shape, dtype=np.int64))
     if not count:
         return np.zeros(shape, dtype)
     # A copy: a view would keep the data of the whole sequence as long as one of its arrays lives.
-    return np.frombuffer(data, dtype, count, place).reshape(shape).copy()
+    return np.frombuffer(data, dtype, count, offset).reshape(shape).copy()
 
 
-# The code a conversion runs: these rooms of hoidata, and the adapter's own file wherever it lies.
-ROOMS = ("conversion", "datasets", "store", "clips", "objects", "hands", "geometry", "files", "workers.py", "errors.py")
+# Packages and modules of hoidata that a conversion runs; the digest of code also covers the adapter's file.
+CODE_PATHS = (
+    "conversion",
+    "datasets",
+    "store",
+    "clips",
+    "objects",
+    "hands",
+    "geometry",
+    "files",
+    "workers.py",
+    "errors.py",
+)
 LIBRARIES = ("numpy", "scipy", "torch", "trimesh")
 _CACHED_ARRAYS = 32
 Item = Clip | HandRecording | Quarantined
@@ -138,34 +153,34 @@ Item = Clip | HandRecording | Quarantined
 
 @dataclass(frozen=True)
 class FinishedWork:
-    """The folder of finished sequences of one job. root: of the raw files."""
+    """The folder of finished sequences of one job."""
 
     folder: Path
-    root: Path
+    root: Path  # of the raw files
     _arrays: dict[str, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
 
     def open(self, job: Mapping[str, Any]) -> None:
-        """Keep what is there if it comes from an equal ``job``, else start anew. Only under ``exclusive``."""
-        stated, text = self.folder / "job.json", canonical_json(job)
-        if not stated.is_file() or stated.read_text(encoding="utf-8") != text:
+        """Keep the folder if it comes from an equal ``job``, else clear it. The caller has the lock ``exclusive``."""
+        job_file, text = self.folder / "job.json", canonical_json(job)
+        if not job_file.is_file() or job_file.read_text(encoding="utf-8") != text:
             self.remove()
             self.folder.mkdir(parents=True)
-            stated.write_text(text, encoding="utf-8")
+            job_file.write_text(text, encoding="utf-8")
         for name in ("sequences", "shared"):
             (self.folder / name).mkdir(exist_ok=True)
             for partial in (self.folder / name).glob(".*.part"):
                 partial.unlink(missing_ok=True)
 
     def remove(self) -> None:
-        """Delete the folder; a kill meanwhile leaves none that could be taken for a whole one."""
-        dead = self.folder.with_suffix(".dead.part")  # a name that ``remove_leftovers`` knows
+        """Delete the folder. Renames it first, so that a kill does not leave a partial folder under its name."""
+        dead = self.folder.with_suffix(".dead.part")  # a name that ``remove_leftovers`` deletes
         if self.folder.exists():
             shutil.rmtree(dead, ignore_errors=True)
             os.replace(self.folder, dead)
         shutil.rmtree(dead, ignore_errors=True)
 
-    def keep(self, key: SequenceKey, results: list[Item], sources: Sequence[SourceFile] | None) -> None:
-        """Write the results of one sequence. sources: what was read; None for one that failed and is to be redone."""
+    def save(self, key: SequenceKey, results: list[Item], sources: Sequence[SourceFile] | None) -> None:
+        """Write the results of one sequence. sources: the files read; None if the next run must convert it again."""
         packer = Packer(self._share)
         try:
             packed = packer.pack(results)
@@ -180,20 +195,20 @@ class FinishedWork:
             remedy = "make room there and run again: finished sequences are kept"
             raise BadInput(self.folder, "a folder that can be written", str(error), remedy) from error
 
-    def holds(self, key: SequenceKey) -> bool:
-        """Whether the sequence was finished, and its sources are still as they were then."""
+    def is_finished(self, key: SequenceKey) -> bool:
+        """Whether the sequence is finished and its sources are unchanged."""
         try:
-            # Opened here: NumPy leaves the file open when it is no archive.
+            # Opened here, because NumPy does not close a file that is not an archive.
             with open(self._file(key), "rb") as stream, np.load(stream, allow_pickle=False) as archive:
-                stated = json.loads(archive["sources"].tobytes())
-            if stated["state"] is None or not all(self._shared_file(name).is_file() for name in stated["shared"]):
+                saved = json.loads(archive["sources"].tobytes())
+            if saved["state"] is None or not all(self._shared_file(name).is_file() for name in saved["shared"]):
                 return False
-            return stated["state"] == self._state(stated["state"]["files"])
+            return saved["state"] == self._state(saved["state"]["files"])
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
-            return False  # not there, or damaged: it is made again
+            return False  # missing or damaged: the sequence is converted again
 
     def read(self, key: SequenceKey) -> list[Item]:
-        """The results of one finished sequence, equal in every bit to those that were kept."""
+        """The results of one finished sequence, equal in every bit to those that were saved."""
         arrays = read_npz(self._file(key))
         return unpack(json.loads(arrays["results"].tobytes()), arrays["data"], self._shared)
 
@@ -218,7 +233,7 @@ class FinishedWork:
         return self._arrays[name]
 
     def _state(self, paths: Iterable[str]) -> dict[str, Any]:
-        """Sizes and times of the sources, and of the folders above them: a file that is added changes its folder."""
+        """Sizes and times of the sources, and of the folders above them, which change when a file is added."""
         paths = sorted(paths)
         above = sorted({parent.as_posix() for path in paths for parent in Path(path).parents})
         return {
@@ -227,7 +242,7 @@ class FinishedWork:
         }
 
 
-def job_of(
+def job_description(
     adapter: Adapter,
     hands: HandPair,
     root: Path,
@@ -235,7 +250,7 @@ def job_of(
     manifest: Mapping[str, SourceFile] | None,
     synthetic: bool,
 ) -> dict[str, Any]:
-    """All that decides the results of a conversion but the raw files themselves, as JSON values."""
+    """Everything that determines the results of a conversion except the raw files, as JSON values."""
     kind = type(adapter)
     listed = None if manifest is None else [[path, manifest[path].sha256] for path in sorted(manifest)]
     return {
@@ -261,22 +276,23 @@ def _settings(adapter: Adapter) -> dict[str, Any]:
 
 
 def _code_digest(kind: type) -> str:
-    """Digest of every Python file of the rooms a conversion uses, and of the files of the adapter's classes."""
-    house = Path(__file__).parents[1]
-    files = {path for room in ROOMS for path in ((house / room).rglob("*.py"), [house / room])[room.endswith(".py")]}
+    """Digest of every Python file in ``CODE_PATHS`` and of the files of the adapter's classes."""
+    package_folder = Path(__file__).parents[1]
+    code = [package_folder / name for name in CODE_PATHS]
+    files = {file for path in code for file in ([path] if path.suffix == ".py" else path.rglob("*.py"))}
     for ancestor in kind.__mro__[:-1]:
         try:
             files.add(Path(inspect.getfile(ancestor)))
-        except (TypeError, OSError):  # built into Python, or typed at a prompt
+        except (TypeError, OSError):  # built into Python, or defined in an interactive session
             continue
     return sha256_bytes("".join(f"{sha256_file(path)}  {path}\n" for path in sorted(files)).encode())
 
 
 def _stamp(path: Path) -> Any:
-    """Size and time of a file; of a folder of frame files, a digest of those of all its files."""
-    facts = os.stat(path)
+    """Size and time of a file. For a folder of frame files: the digest of sizes and times of its files."""
+    status = os.stat(path)
     if not path.is_dir():
-        return [facts.st_size, facts.st_mtime_ns]
+        return [status.st_size, status.st_mtime_ns]
     with os.scandir(path) as items:
         lines = sorted(f"{item.name} {item.stat().st_size} {item.stat().st_mtime_ns}" for item in items)
     return sha256_bytes("\n".join(lines).encode())

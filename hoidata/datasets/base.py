@@ -1,8 +1,12 @@
-"""What an adapter is: a named reader of one dataset's raw files that gives clips.
+"""The adapter interface: one class per dataset converts raw files to clips.
 
-Three short steps in one file and one class:
-locate (``sequences``: which sequences are there), load (read the files of one sequence through ``RawTree``) and
-convert (change of frame, unit and convention, into ``Clip``). Nothing outside an adapter knows a dataset's quirks.
+An adapter works in three steps:
+
+1. locate: ``sequences`` lists the sequences of a raw folder by file name;
+2. load: ``load`` reads the files of one sequence through ``RawTree``, which records and checks them;
+3. convert: ``load`` changes frame, unit and hand convention and returns each ``Clip``.
+
+Code outside of the adapters is independent of the dataset.
 """
 
 import os
@@ -23,20 +27,20 @@ from hoidata.errors import BadInput, ChangedMeanwhile
 from hoidata.files import sha256_bytes, sha256_file
 from hoidata.hands import HandPair
 
-__all__ = ["Adapter", "DatasetPart", "Described", "Quarantined", "RawTree", "Recorded", "SequenceKey"]
+__all__ = ["Adapter", "AdapterBase", "DatasetPart", "HasHandRecordings", "Quarantined", "RawTree", "SequenceKey"]
 
-_SMALL_BYTES = 65536
-_LARGEST_FILE = 256 << 20
-_LARGEST_FRAME_FILE = 1 << 20
+_SMALL_FILE_BYTES = 65536
+_MAX_FILE_BYTES = 256 << 20
+_MAX_FRAME_FILE_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, order=True)
 class SequenceKey:
-    """One raw sequence. name: its path-like name below the dataset (``s1/mug_drink_1``); subject: as in the source."""
+    """Identifies one raw sequence; ``str(key)`` is the beginning of the ids of its clips."""
 
     dataset: str
-    subject: str
-    name: str
+    subject: str  # the person, as the source names them
+    name: str  # unique in the dataset, with slashes: s1/mug_drink_1
 
     def __str__(self) -> str:
         return f"{self.dataset}/{self.name}"
@@ -44,94 +48,124 @@ class SequenceKey:
 
 @dataclass(frozen=True)
 class DatasetPart:
-    """Files a raw folder must hold: at least one match of one of ``patterns`` (globs below the raw root).
+    """A group of files that a raw folder contains; the part is present if one file matches one of the patterns.
 
-    Every file the adapter may read matches a pattern of some part: no other is scanned into a manifest.
-    what: in words; where: the archive or page it comes from. optional: conversion works without it. unneeded_with: the
-    setting of the adapter that makes a required part optional, ``clips=whole``, or "".
+    Every file that the adapter reads must match a pattern of some part: ``hoidata raw scan`` lists only these files.
     """
 
-    what: str
-    patterns: tuple[str, ...]
-    where: str
-    optional: bool = False
-    unneeded_with: str = ""
+    contents: str  # in words: hand motion
+    patterns: tuple[str, ...]  # globs below the raw root
+    archive: str  # the archive or page to download
+    optional: bool = False  # conversion works without it
+    unneeded_with: str = ""  # the adapter's setting that makes a required part optional, such as clips=whole
 
     def is_in(self, root: Path) -> bool:
+        """Whether the raw folder ``root`` has a file of this part."""
         return any(next(Path(root).glob(pattern), None) is not None for pattern in self.patterns)
 
-    def holds(self, path: str) -> bool:
-        """Whether a source of that path matches a pattern; a folder of frame files is known by its files."""
-        tries = [text.split("/") for text in (path, f"{path}/000000.txt")]
+    def matches(self, path: str) -> bool:
+        """Whether a source file matches a pattern. A folder of frame files matches if its files do."""
+        candidates = [text.split("/") for text in (path, f"{path}/000000.txt")]
         patterns = [pattern.split("/") for pattern in self.patterns]
-        return any(len(names) == len(p) and all(map(fnmatchcase, names, p)) for p in patterns for names in tries)
+        return any(len(names) == len(p) and all(map(fnmatchcase, names, p)) for p in patterns for names in candidates)
 
 
 @runtime_checkable
 class Adapter(Protocol):
-    """Reader of one dataset. Must be picklable (a frozen dataclass without open files): workers get a copy.
+    """Reads one dataset. Must be picklable, as a frozen dataclass without open files is: workers receive a copy.
 
-    Its settings (margins, which hands) are dataclass fields with defaults, set in params.yaml under ``convert``.
-
-    name: of the dataset, lower case. version: of the release the adapter reads. licence, where_to_register: shown to
-    users who lack the data. may_be_shared: the licence lets derived data be passed on.
-    needs_mano: the raw files hold MANO parameters, meaningless without the licensed MANO files.
-    source_fps: frames per second of the raw files (a file's own figure wins).
-    frame: the world frame of its clips. hand_convention: what the source's hand parameters mean.
-    parts: what a complete raw folder holds, and where each part is to be had.
+    Settings are dataclass fields with defaults. Users set them under ``convert`` in params.yaml.
     """
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Name of the dataset: lower-case letters, digits and ``_``."""
+        ...
+
     @property
-    def version(self) -> str: ...
+    def version(self) -> str:
+        """Release of the dataset that the adapter reads."""
+        ...
+
     @property
-    def licence(self) -> str: ...
+    def licence(self) -> str:
+        """Licence of the dataset in words."""
+        ...
+
     @property
-    def may_be_shared(self) -> bool: ...
+    def may_be_shared(self) -> bool:
+        """Whether the licence permits passing on derived data."""
+        ...
+
     @property
-    def where_to_register(self) -> str: ...
+    def where_to_register(self) -> str:
+        """Page on which users get the raw files."""
+        ...
+
     @property
-    def needs_mano(self) -> bool: ...
+    def needs_mano(self) -> bool:
+        """Whether the raw files have MANO parameters, which are useless without the licensed MANO files."""
+        ...
+
     @property
-    def source_fps(self) -> float: ...
+    def source_fps(self) -> float:
+        """Frames per second of the raw files; a rate stated in a file takes precedence."""
+        ...
+
     @property
-    def frame(self) -> WorldFrame: ...
+    def frame(self) -> WorldFrame:
+        """World frame of the clips."""
+        ...
+
     @property
-    def hand_convention(self) -> HandConvention: ...
+    def hand_convention(self) -> HandConvention:
+        """Meaning of the source's hand parameters."""
+        ...
+
     @property
-    def parts(self) -> tuple[DatasetPart, ...]: ...
+    def parts(self) -> tuple[DatasetPart, ...]:
+        """Files of a complete raw folder, and the archive of each."""
+        ...
 
     def sequences(self, root: Path) -> list[SequenceKey]:
-        """Locate: the keys of all sequences below ``root``, sorted. Looks at names only, opens no motion file."""
+        """Locate: the keys of all sequences below ``root``, sorted. Reads file names only and opens no file."""
         ...
 
     def load(self, raw: "RawTree", key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
-        """Load and convert one sequence: its clips, and the stretches left out of it.
+        """Load and convert one sequence.
 
-        Every file is reached through ``raw``. Raises BadInput when the whole sequence cannot be used.
+        Args:
+            raw: the raw folder; the adapter opens every file through it.
+            key: one of ``sequences``.
+            hands: hand models of both sides, which turn hand parameters into joints.
+
+        Returns:
+            The clips, and a ``Quarantined`` with the reason for every interval that gives no clip.
+
+        Raises:
+            BadInput: the whole sequence is unusable.
         """
         ...
 
 
 @runtime_checkable
-class Recorded(Protocol):
-    """An adapter whose source has hands of its own skeleton, which are kept beside the clips."""
+class HasHandRecordings(Protocol):
+    """An adapter whose source has hands with another skeleton than MANO's; the store has them next to the clips."""
 
     def recordings(self, raw: "RawTree", key: SequenceKey) -> list[HandRecording]:
-        """The whole recording of one sequence, or none where the files that describe the hand are missing."""
+        """The whole recording of one sequence; empty if the files that describe the hand are missing."""
         ...
 
 
-class Described:
-    """The facts of an adapter, as ``facts.toml`` of its folder states them; it declares ``facts`` alone.
+class AdapterBase:
+    """Base class of adapters: takes name, licence and other facts from ``facts.toml`` in the adapter's folder.
 
-    Its settings are dataclass fields of type int (0 or more), bool or Literal, and checked by that type.
+    A subclass declares ``facts``. Its settings are dataclass fields of type int (0 or more), bool or Literal. Creating
+    an adapter with a value of another type raises BadInput.
     """
 
     facts: ClassVar[DatasetFacts]
-    # The setting with which no MANO files are needed, where there is one: ``hands=keypoints``.
-    without_mano: ClassVar[str] = ""
+    without_mano: ClassVar[str] = ""  # the setting that makes MANO files unnecessary, such as hands=keypoints
 
     name = property(attrgetter("facts.name"))
     version = property(attrgetter("facts.version"))
@@ -155,47 +189,50 @@ class Described:
 
 @dataclass
 class RawTree:
-    """A raw dataset folder that remembers what was read from it and checks it against a manifest.
+    """A raw dataset folder that records the files read from it and checks them against a manifest.
 
-    Paths are relative to ``root`` with forward slashes. ``sources`` holds every file read so far (a folder of
-    per-frame files counts as one, see ``read_folder``). With a manifest (path -> SourceFile), a file whose digest
-    differs, or that is not listed, raises BadInput.
+    Paths are relative to ``root``, with forward slashes. If there is a manifest, reading a file that it does not list
+    or whose digest differs raises BadInput.
     """
 
     root: Path
-    manifest: Mapping[str, SourceFile] | None = None
+    manifest: Mapping[str, SourceFile] | None = None  # by path
     _sources: dict[str, SourceFile] = field(default_factory=dict)
     _inside_of_root: dict[str, bool] = field(default_factory=dict)
 
     @property
     def sources(self) -> tuple[SourceFile, ...]:
+        """All files read so far, sorted by path. A folder read by ``read_folder`` is one entry."""
         return tuple(self._sources[path] for path in sorted(self._sources))
 
-    def recorded(self, *places: str) -> tuple[SourceFile, ...]:
-        """The sources read so far that are one of these paths or lie below one of them, sorted by path."""
-        return tuple(s for s in self.sources if any(s.path == p or s.path.startswith(f"{p}/") for p in places))
+    def recorded(self, *paths: str) -> tuple[SourceFile, ...]:
+        """The files read so far at or below these paths, sorted by path."""
+        return tuple(s for s in self.sources if any(s.path == p or s.path.startswith(f"{p}/") for p in paths))
 
     def file(self, path: str) -> Path:
-        """The absolute path of one file, after recording and checking it. Raises BadInput when it is missing."""
-        place = self._inside(path)
-        self._record(SourceFile(path, place.stat().st_size, sha256_file(place)))
-        return place
+        """Record and check one file; returns its path on disk. Raises BadInput if it is missing."""
+        file = self._inside(path)
+        self._record(SourceFile(path, file.stat().st_size, sha256_file(file)))
+        return file
 
-    def read(self, path: str, largest: int = _LARGEST_FILE) -> bytes:
-        """The bytes of one file of at most ``largest`` bytes (256 MiB), recorded and checked."""
-        place = self._inside(path)
-        size = place.stat().st_size
-        if size > largest:
-            raise BadInput(path, f"a file of at most {largest} bytes", f"{size} bytes")
-        data = place.read_bytes()
+    def read(self, path: str, max_bytes: int = _MAX_FILE_BYTES) -> bytes:
+        """Record and check one file; returns its bytes. Raises BadInput if it is missing or too large."""
+        file = self._inside(path)
+        size = file.stat().st_size
+        if size > max_bytes:
+            raise BadInput(path, f"a file of at most {max_bytes} bytes", f"{size} bytes")
+        data = file.read_bytes()
         self._record(SourceFile(path, len(data), sha256_bytes(data)))
         return data
 
     def read_folder(self, folder: str, names: Iterable[str]) -> list[bytes]:
-        """The bytes of many small files of one folder; recorded as one source.
+        """Read many small files of one folder and record the folder as one source.
 
-        Its digest is the SHA-256 of one ``<sha256>  <name>`` line per file, its size the sum. In a manifest either
-        the files or the folder may be listed.
+        The folder's digest is the SHA-256 of one ``<sha256>  <name>`` line per file, and its size is the sum.
+        A manifest lists either the files or the folder.
+
+        Returns:
+            The bytes of each file, in the order of ``names``.
         """
         contents, lines = [], []
         listed = self.manifest is not None and folder not in self.manifest
@@ -212,35 +249,36 @@ class RawTree:
         return contents
 
     def names(self, folder: str, suffix: str = "") -> list[str]:
-        """Sorted names of the plain files in a folder that end in ``suffix`` (any case); none when it is absent."""
-        place = self.root / folder
-        if not place.is_dir():
+        """Sorted names of a folder's files that end in ``suffix`` in any case; empty if the folder is missing."""
+        path = self.root / folder
+        if not path.is_dir():
             return []
-        with os.scandir(place) as items:
+        with os.scandir(path) as items:
             return sorted(item.name for item in items if item.name.lower().endswith(suffix) and item.is_file())
 
     def has(self, path: str) -> bool:
+        """Whether the file exists."""
         return (self.root / path).is_file()
 
     def _small_files(self, folder: str, names: Iterable[str]) -> Iterator[tuple[str, bytes]]:
-        """Name and bytes of each file. The folder is opened once: a path per file costs more than the bytes do."""
+        """Yield name and bytes of each file. Opens the folder once, because resolving each path is slow."""
         if not self._is_inside(folder) or not (self.root / folder).is_dir():
             yield from ((name, self._read_linked_or_large(f"{folder}/{name}")) for name in names)
             return
-        opened = os.open(self.root / folder, os.O_RDONLY | os.O_DIRECTORY)
+        descriptor = os.open(self.root / folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
             for name in names:
-                data = _read_small(opened, name)
+                data = _read_small(descriptor, name)
                 yield name, self._read_linked_or_large(f"{folder}/{name}") if data is None else data
         finally:
-            os.close(opened)
+            os.close(descriptor)
 
     def _read_linked_or_large(self, path: str) -> bytes:
-        place = self._inside(path)
-        size = place.stat().st_size
-        if size > _LARGEST_FRAME_FILE:
-            raise BadInput(path, f"a file of one frame, at most {_LARGEST_FRAME_FILE} bytes", f"{size} bytes")
-        return place.read_bytes()
+        file = self._inside(path)
+        size = file.stat().st_size
+        if size > _MAX_FRAME_FILE_BYTES:
+            raise BadInput(path, f"a file of one frame, at most {_MAX_FRAME_FILE_BYTES} bytes", f"{size} bytes")
+        return file.read_bytes()
 
     def _is_inside(self, path: str) -> bool:
         if path not in self._inside_of_root:
@@ -248,31 +286,31 @@ class RawTree:
         return self._inside_of_root[path]
 
     def _inside(self, path: str) -> Path:
-        place = self.root / path
-        if not place.is_file():
-            kind = ChangedMeanwhile if path in (self.manifest or ()) else BadInput
-            raise kind(path, "a file", "nothing there", "check that the download is complete and unpacked here")
+        file = self.root / path
+        if not file.is_file():
+            error_type = ChangedMeanwhile if path in (self.manifest or ()) else BadInput
+            raise error_type(path, "a file", "nothing there", "check that the download is complete and unpacked here")
         if not self._is_inside(path):
             raise BadInput(path, "a file inside the raw folder", "a link that leaves it", "replace the link by a copy")
-        return place
+        return file
 
     def _record(self, source: SourceFile) -> None:
         if self.manifest is not None:
             self._check(source)
         self._sources[source.path] = source
 
-    def _check(self, found: SourceFile) -> None:
-        listed = (self.manifest or {}).get(found.path)
+    def _check(self, source: SourceFile) -> None:
+        listed = (self.manifest or {}).get(source.path)
         if listed is None:
-            raise BadInput(found.path, "a file listed in the manifest", "an unlisted one", "scan the raw folder again")
-        if listed.sha256 != found.sha256:
+            raise BadInput(source.path, "a file listed in the manifest", "an unlisted one", "scan the raw folder again")
+        if listed.sha256 != source.sha256:
             expected = f"SHA-256 {listed.sha256[:12]} ({listed.size} bytes)"
-            got = f"{found.sha256[:12]} ({found.size} bytes)"
-            raise ChangedMeanwhile(found.path, expected, got, "restore the file, or scan the raw folder again")
+            got = f"{source.sha256[:12]} ({source.size} bytes)"
+            raise ChangedMeanwhile(source.path, expected, got, "restore the file, or scan the raw folder again")
 
 
 def _read_small(folder: int, name: str) -> bytes | None:
-    """The bytes of a file of an open folder; None for a link, a missing file, another folder's or a big one."""
+    """The bytes of a small file in an open folder; None if it is missing, large, a link or in another folder."""
     if "/" in name:
         return None
     try:
@@ -280,9 +318,9 @@ def _read_small(folder: int, name: str) -> bytes | None:
     except OSError:
         return None
     try:
-        data = os.read(stream, _SMALL_BYTES)
+        data = os.read(stream, _SMALL_FILE_BYTES)
     except OSError:
         return None
     finally:
         os.close(stream)
-    return data if len(data) < _SMALL_BYTES else None
+    return data if len(data) < _SMALL_FILE_BYTES else None

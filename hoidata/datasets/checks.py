@@ -1,9 +1,10 @@
-"""Checks every adapter makes on raw numbers: each failure is a BadInput that names the file, expected and got."""
+"""Checks of raw numbers for all adapters. A failed check raises BadInput with file, expected and actual value."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NoReturn, get_args, get_origin, get_type_hints
 
 import numpy as np
+import orjson
 
 from hoidata.clips.clip import BodyTrack
 from hoidata.errors import BadInput
@@ -11,41 +12,53 @@ from hoidata.errors import BadInput
 BODY_COLUMNS = {"transl": 3, "global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3}
 
 
-def table(where: str, value: Any, columns: int, rows: int | None = None, row: str = "frames") -> np.ndarray:
-    """``value`` as a finite float64 array (row, column).
+def table(location: str, value: Any, columns: int, rows: int | None = None, row_name: str = "frames") -> np.ndarray:
+    """Convert ``value`` to a finite float64 array of shape (rows, columns).
 
-    rows: how many are expected, None for any number from 1. row: what they are called in errors.
+    Args:
+        location: file and entry, for errors.
+        value: nested lists or an array.
+        columns: required number of columns.
+        rows: required number of rows; None accepts any number from 1.
+        row_name: what errors call the rows.
+
+    Raises:
+        BadInput: another shape or type, NaN or infinity.
     """
     try:
         array = np.asarray(value)
     except ValueError as error:  # nested lists of unequal lengths
-        raise BadInput(where, "rows of equal length", str(error)[:80]) from error
+        raise BadInput(location, "rows of equal length", str(error)[:80]) from error
     if array.dtype.kind not in "fiu":
-        raise BadInput(where, "numbers", f"an array of type {array.dtype}")
+        raise BadInput(location, "numbers", f"an array of type {array.dtype}")
     if array.ndim != 2 or array.shape[1] != columns:
-        raise BadInput(where, f"an array of {columns} columns", f"shape {array.shape}")
+        raise BadInput(location, f"an array of {columns} columns", f"shape {array.shape}")
     if rows is not None and len(array) != rows:
-        raise BadInput(where, f"{rows} {row}", f"{len(array)}")
+        raise BadInput(location, f"{rows} {row_name}", f"{len(array)}")
     if not len(array):
-        raise BadInput(where, "at least one frame", "none")
-    finite(where, array)
+        raise BadInput(location, "at least one frame", "none")
+    finite(location, array)
     return array.astype(np.float64)
 
 
-def finite(where: str, array: np.ndarray) -> None:
-    """Refuse NaN and infinity, naming the first frame that holds one."""
+def finite(location: str, array: np.ndarray) -> None:
+    """Raise BadInput that names the first row with NaN or infinity. array: (row, ...)."""
     good = np.isfinite(array).reshape(len(array), -1).all(axis=1)
     if not good.all():
-        raise BadInput(where, "finite numbers", f"NaN or infinity in row {int(np.argmin(good))}")
+        raise BadInput(location, "finite numbers", f"NaN or infinity in row {int(np.argmin(good))}")
 
 
-def body_track(where: str, params: Any, n_frames: int, further: Mapping[str, int] | None = None) -> BodyTrack:
+def body_track(location: str, params: Any, n_frames: int, further: Mapping[str, int] | None = None) -> BodyTrack:
     """The parameters of the person's SMPL-X body, float32.
 
-    further: columns of the entries not every source has.
+    Args:
+        location: file and entry, for errors.
+        params: entries of ``BODY_COLUMNS``, each (frame, column).
+        n_frames: required number of frames.
+        further: number of columns of further entries that only this source has.
     """
     values = {
-        name: table(f"{where}: {name}", entry(where, params, name), columns, n_frames).astype(np.float32)
+        name: table(f"{location}: {name}", entry(location, params, name), columns, n_frames).astype(np.float32)
         for name, columns in {**BODY_COLUMNS, **(further or {})}.items()
     }
     face = np.concatenate([values.pop(name) for name in ("jaw_pose", "leye_pose", "reye_pose")], axis=1)
@@ -53,13 +66,18 @@ def body_track(where: str, params: Any, n_frames: int, further: Mapping[str, int
 
 
 def rigid_transforms(folder: str, names: Sequence[str], matrices: np.ndarray) -> None:
-    """Refuse 4x4 matrices (frame, 4, 4) that do not turn and shift column vectors, to 1e-3; names: file of each frame.
+    """Raise BadInput unless all matrices are rigid transforms of column vectors, to 1e-3.
 
-    A matrix written column by column has its shift in the last row, so it is noticed.
+    Detects transposed matrices, because these have the translation in the last row.
+
+    Args:
+        folder: of the files, for errors.
+        names: file of each frame, for errors.
+        matrices: (frame, 4, 4).
     """
     rotation, last_row = matrices[:, :3, :3], matrices[:, 3]
-    turn_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    error = np.maximum(turn_error, np.abs(last_row - (0, 0, 0, 1)).max(axis=1))
+    rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    error = np.maximum(rotation_error, np.abs(last_row - (0, 0, 0, 1)).max(axis=1))
     bad = (error > 1e-3) | (np.linalg.det(rotation) < 0)
     if bad.any():
         first = int(bad.argmax())
@@ -67,17 +85,25 @@ def rigid_transforms(folder: str, names: Sequence[str], matrices: np.ndarray) ->
         raise BadInput(f"{folder}/{names[first]}", "a rotation and a shift above the row 0 0 0 1", got)
 
 
-def entry(where: str, mapping: Any, key: str) -> Any:
-    """``mapping[key]``, naming the file and the keys there are when it is missing."""
+def json_value(location: str, data: bytes) -> Any:
+    """Parse JSON. Raises BadInput that names the location."""
+    try:
+        return orjson.loads(data)
+    except ValueError as error:  # orjson.JSONDecodeError, or text in another encoding
+        raise BadInput(location, "JSON text", str(error)[:80]) from error
+
+
+def entry(location: str, mapping: Any, key: str) -> Any:
+    """``mapping[key]``. Raises BadInput that lists the present keys if it is missing."""
     if not isinstance(mapping, Mapping):
-        raise BadInput(where, f"a dictionary with {key!r}", type(mapping).__name__)
+        raise BadInput(location, f"a dictionary with {key!r}", type(mapping).__name__)
     if key not in mapping:
-        raise BadInput(where, f"the entry {key!r}", f"only {', '.join(sorted(map(str, mapping))) or 'none'}")
+        raise BadInput(location, f"the entry {key!r}", f"only {', '.join(sorted(map(str, mapping))) or 'none'}")
     return mapping[key]
 
 
 def settings(adapter: Any) -> None:
-    """Refuse a value that the type of its setting excludes: a whole number of 0 or more, true or false, a choice."""
+    """Raise BadInput if a setting's value does not fit its type: int of 0 or more, bool or a Literal."""
     for name, kind in get_type_hints(type(adapter)).items():
         value = getattr(adapter, name)
         if kind is int and (isinstance(value, bool) or not isinstance(value, int) or value < 0):
@@ -89,4 +115,5 @@ def settings(adapter: Any) -> None:
 
 
 def refuse_setting(adapter: str, name: str, expected: str, value: Any) -> NoReturn:
+    """Raise BadInput for the value of an adapter's setting."""
     raise BadInput(f"settings of the adapter {adapter}: {name}", expected, repr(value)[:40], "correct params.yaml")

@@ -1,12 +1,12 @@
-"""The conventions of the built-in datasets side by side, made from their ``facts.toml``.
+"""Generates the table of the built-in datasets' conventions from their ``facts.toml``.
 
-``python -m hoidata.datasets.convention_table > hoidata/datasets/CONVENTIONS.md`` writes the table anew.
+``python -m hoidata.datasets.convention_table > hoidata/datasets/CONVENTIONS.md`` writes the table.
 """
 
 from hoidata.dataset_folders import built_in_names, dataset_facts
 from hoidata.errors import BadInput
 
-# What a dataset's facts may state, in the order of the table.
+# Allowed keys of ``conventions`` in facts.toml, in the order of the table.
 ROWS = (
     "unit",
     "handedness of the world",
@@ -32,10 +32,10 @@ ROWS = (
 )
 HEAD = """# Conventions of the sources
 
-What each source means by its numbers, from `<dataset>/facts.toml`. Every cell has a test that fails when the adapter
-reads it otherwise: it puts literal numbers through a formula of its own and asserts that the flipped convention is off
-by more than 5 mm (or by a frame, a part, a name, a side). `tests/hoidata/datasets/<dataset>/test_contract.py` names the
-test of each cell. A dash: the source has no such thing.
+Meaning of the numbers of each source, from `<dataset>/facts.toml`. Every cell has a test that fails if the adapter
+follows another convention. The test compares the adapter with an independent formula and asserts that the flipped
+convention is off by more than 5 mm (or by a frame, a part, a name, a side).
+`tests/hoidata/datasets/<dataset>/test_contract.py` names the test of each cell. A dash means not applicable.
 
 """
 

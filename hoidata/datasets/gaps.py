@@ -1,8 +1,12 @@
-"""Gaps in the poses of a tracked object: short ones are bridged and marked, long ones end a clip and are reported.
+"""Interpolates short gaps in the poses of a tracked object, and reports long ones.
 
-A source may lack an object's pose in some frames while hands and the other objects go on. Adapters of such sources
-call ``bridge`` on the whole track, cut clips from frames that ``has_pose``, begin and end them with a recorded frame
-(``trimmed``), mark made frames (``numbered``) and report the gaps that are left (``missing_poses``).
+A source may lack an object's pose in some frames in which hands and other objects are tracked. Its adapter
+
+1. interpolates the whole track with ``bridge``;
+2. cuts clips from frames that ``has_pose`` accepts;
+3. begins and ends them with a recorded frame (``trim_to_recorded``);
+4. marks interpolated frames (``mark_interpolated``);
+5. reports the remaining gaps (``missing_poses``).
 """
 
 from dataclasses import replace
@@ -17,64 +21,83 @@ from hoidata.geometry.intervals import Interval, bridged, runs
 
 # Frames at 30 per second. Interpolated poses of objects that people move are within 5 mm and 4 degrees in 95 of 100
 # such gaps; with 5 frames they are within 8 mm and 6 degrees.
-LONGEST_BRIDGED = 3
-_NEIGHBOURS = 4  # tracked frames used on each side of a gap
-_SHOWN = 5
+MAX_BRIDGED_FRAMES = 3
+_NEIGHBOUR_FRAMES = 4  # tracked frames used on each side of a gap
+_MAX_LISTED_GAPS = 5
 
 
 def has_pose(tracked: np.ndarray) -> np.ndarray:
-    """(frame,) bool: tracked frames, and those of gaps of at most three frames between them."""
-    return bridged(tracked, LONGEST_BRIDGED)
+    """Tracked frames, and frames in gaps of at most three between them. tracked and result: (frame,) bool."""
+    return bridged(tracked, MAX_BRIDGED_FRAMES)
 
 
 def bridge(track: ObjectTrack, tracked: np.ndarray) -> ObjectTrack:
-    """The track with interpolated poses in gaps of at most three frames: cubic splines through the frames around each.
+    """Interpolate gaps of at most three frames by cubic splines through the frames around each gap.
 
-    track: at 30 frames per second. tracked: (frame,) bool; other frames of the track may hold anything.
+    Args:
+        track: at 30 fps; poses of untracked frames are ignored.
+        tracked: (frame,) bool.
     """
     values = {"rotvec": track.rotvec.copy(), "translation_m": track.translation_m.copy()}
     if track.hinge_rad is not None:
         values["hinge_rad"] = track.hinge_rad.copy()
     for start, stop in runs(has_pose(tracked) & ~tracked):
-        around = np.arange(max(0, start - _NEIGHBOURS), min(len(tracked), stop + _NEIGHBOURS))
-        known, gap = around[tracked[around]], np.arange(start, stop)
+        around = np.arange(max(0, start - _NEIGHBOUR_FRAMES), min(len(tracked), stop + _NEIGHBOUR_FRAMES))
+        known_frames, gap = around[tracked[around]], np.arange(start, stop)
         for name, array in values.items():
-            known_values = array[known].astype(np.float64)
+            values_at_known = array[known_frames].astype(np.float64)
             if name == "rotvec":
-                array[gap] = RotationSpline(known, Rotation.from_rotvec(known_values))(gap).as_rotvec()
+                array[gap] = RotationSpline(known_frames, Rotation.from_rotvec(values_at_known))(gap).as_rotvec()
             else:
-                array[gap] = CubicSpline(known, known_values)(gap)
+                array[gap] = CubicSpline(known_frames, values_at_known)(gap)
     return replace(track, **values)
 
 
-def trimmed(interval: tuple[int, int], recorded: np.ndarray) -> Interval:
-    """The interval from its first to its last recorded frame; empty where there is none. recorded: (frame,) bool."""
+def trim_to_recorded(interval: tuple[int, int], recorded: np.ndarray) -> Interval:
+    """The interval from its first to its last recorded frame; empty if it has none. recorded: (frame,) bool."""
     start, stop = interval
     inside = start + np.flatnonzero(recorded[start:stop])
     return Interval(int(inside[0]), int(inside[-1]) + 1) if len(inside) else Interval(start, start)
 
 
-def numbered(source_frames: np.ndarray, recorded: np.ndarray) -> np.ndarray:
-    """(frame,) numbers in which a made frame has that of the recorded one before it, as ``Clip.recorded`` reads them.
+def mark_interpolated(source_frames: np.ndarray, recorded: np.ndarray) -> np.ndarray:
+    """Give each interpolated frame the source number of the recorded frame before it: see ``Clip.recorded``.
 
-    recorded: (frame,) bool, True in the first frame.
+    Args:
+        source_frames: (frame,) numbers in the source.
+        recorded: (frame,) bool, True in the first frame.
+
+    Returns:
+        (frame,) source numbers.
     """
     return np.maximum.accumulate(np.where(recorded, source_frames, source_frames[0]))
 
 
 def missing_poses(
-    source_key: str, where: str, what: str, source_frames: np.ndarray, tracked: np.ndarray
+    source_key: str, location: str, object_name: str, source_frames: np.ndarray, tracked: np.ndarray
 ) -> list[Quarantined]:
-    """One reason that names the gaps of more than three frames between tracked ones; none without such gaps.
+    """Report gaps of more than three frames between tracked frames.
 
-    what: whose poses. source_frames: (frame,) numbers in the source. tracked: (frame,) bool.
+    Args:
+        source_key: of the reason.
+        location: file, for the reason.
+        object_name: for the reason.
+        source_frames: (frame,) numbers in the source.
+        tracked: (frame,) bool.
+
+    Returns:
+        One reason that lists the gaps; empty without such gaps.
     """
-    seen = np.flatnonzero(tracked)
-    gaps = [gap for gap in runs(~has_pose(tracked)) if len(seen) and seen[0] < gap.start < seen[-1]]
+    tracked_frames = np.flatnonzero(tracked)
+    if not len(tracked_frames):
+        return []
+    gaps = [gap for gap in runs(~has_pose(tracked)) if tracked_frames[0] < gap.start < tracked_frames[-1]]
     if not gaps:
         return []
     spans = [f"{source_frames[start]} to {source_frames[stop - 1]}" for start, stop in gaps]
-    more = f" and {len(spans) - _SHOWN} more" if len(spans) > _SHOWN else ""
-    expected = f"poses of {what} without a gap of more than {LONGEST_BRIDGED} frames at 30 per second"
-    got = f"none in source frames {', '.join(spans[:_SHOWN])}{more}"
-    return [Quarantined(source_key, where, expected, got, "nothing to do: clips end there")]
+    more = f" and {len(spans) - _MAX_LISTED_GAPS} more" if len(spans) > _MAX_LISTED_GAPS else ""
+    expected = f"poses of {object_name} without a gap of more than {MAX_BRIDGED_FRAMES} frames at 30 per second"
+    got = f"none in source frames {', '.join(spans[:_MAX_LISTED_GAPS])}{more}"
+    return [
+        Quarantined(source_key, where=location, expected=expected, got=got, remedy="nothing to do: clips end there")
+    ]

@@ -1,9 +1,13 @@
-"""Which way is down, in a recording that does not say: from objects that stand where no hand is near.
+"""Estimates the direction of gravity from objects at rest, for recordings whose world axes are not documented.
 
-An object out of reach stands on one of its stable sides, so each such stretch leaves a few directions. Of these the
-one is kept that a head-worn camera, upright and looking ahead or down, can have below it, and below which no hand
-reaches and the object never sinks while it is moved. Stretches of different objects, or of one turned about, must
-agree; otherwise gravity stays unknown.
+An object without a hand near it rests on one of its stable sides, so each resting interval allows a few directions.
+A direction is rejected if
+
+- it contradicts a head-worn camera that is upright and looks ahead or down;
+- hands reach below the support;
+- the object sinks below the support while it is moved.
+
+Intervals of different objects, or of one object in different poses, must agree. Otherwise gravity is unknown.
 """
 
 from collections.abc import Sequence
@@ -17,151 +21,159 @@ from scipy.spatial.transform import Rotation
 from hoidata.geometry.intervals import runs
 from hoidata.objects.resting import Footing
 
-NO_HAND_M = 0.03  # farther from the object's box than any joint's flesh is thick
+NO_HAND_M = 0.03  # distance from the object's box, more than the tissue around any joint
 STILL_M = 0.005
-MOSTLY_STILL = 0.6  # share of a stretch: single frames may be tracked badly
-FEWEST_FRAMES = 5
-WATCHED_FRAMES = 90  # of motion before and after a stretch
+MIN_STILL_FRACTION = 0.6  # of an interval: single frames may be tracked badly
+MIN_FRAMES = 5
+CONTEXT_FRAMES = 90  # frames before and after an interval that are checked for contradictions
 REACH_M = 0.15
-HANDS_BELOW = 0.02  # share of joints
-BELOW_M = 0.015  # joints and objects this far below the support have gone through it
+MAX_BELOW_FRACTION = 0.02  # of the joints near the object
+BELOW_SUPPORT_M = 0.015  # joints and objects this far below the support penetrate it
 LIFTED_M = 0.03
 CAMERA_CONE_RAD = np.deg2rad(50)
 AGREEMENT_RAD = np.deg2rad(7)
-AGREEING_SHARE = 0.75
-TURNED_M = 0.01  # a corner so far from where it was, the object's middle apart: another object, or it was turned
+MIN_AGREEING_FRACTION = 0.75
+DIFFERENT_POSE_M = 0.01  # corner distance, centres aligned, above which two intervals differ in object or orientation
 
 
 @dataclass(frozen=True)
 class TrackedObject:
-    """One object of a recording in its world. frames: (frame,) bool, where it is tracked; poses: (frame, 4, 4)."""
+    """One object of a recording."""
 
-    footing: Footing
-    frames: np.ndarray
-    poses: np.ndarray
+    footing: Footing  # its stable sides
+    frames: np.ndarray  # (frame,) bool: it is tracked
+    poses: np.ndarray  # (frame, 4, 4) world from object
 
 
 class GravityEstimate(NamedTuple):
-    """direction: (3,) unit vector in the world, or None. note: how it was found, or why it is not known."""
+    """Gravity of one recording."""
 
-    direction: np.ndarray | None
-    note: str
+    direction: np.ndarray | None  # (3,) unit vector in the world; None if unknown
+    note: str  # the evidence, or why it is unknown
 
 
-class _Rest(NamedTuple):
-    """One stretch in which an object stands by itself: its directions down (way, 3) and corners (8, 3), world."""
+class _RestingInterval(NamedTuple):
+    """An interval in which an object rests without a hand near it."""
 
-    ways: np.ndarray
-    corners: np.ndarray
+    downs: np.ndarray  # (direction, 3) possible directions of gravity, world
+    corners: np.ndarray  # (8, 3) of its box, world, metres
     n_frames: int
-    lifted: bool
+    lifted: bool  # it is lifted before or after the interval
 
 
 class _Scene(NamedTuple):
-    """An object and what surrounds it: corners (frame, 8, 3) of its box and joints (frame, joint, 3) in the world."""
+    """An object with the hands and the camera around it, in the world."""
 
-    thing: TrackedObject
-    corners: np.ndarray
-    joints_m: np.ndarray
-    below_head: np.ndarray
+    tracked_object: TrackedObject
+    corners: np.ndarray  # (frame, 8, 3) of its box, metres
+    joints_m: np.ndarray  # (frame, joint, 3), NaN if a hand is not tracked
+    below_head: np.ndarray  # (frame, 3) unit vector between the camera's down and forward axes
 
 
 def estimate_gravity(
     objects: Sequence[TrackedObject], joints_m: np.ndarray, camera_rotation: np.ndarray
 ) -> GravityEstimate:
-    """Gravity of one recording with a static world.
+    """Estimate gravity of one recording whose world is static.
 
-    joints_m: (frame, joint, 3) world positions of both hands, NaN where a hand is not seen. camera_rotation: (frame,
-    3, 3) world from a head-worn camera with OpenCV axes.
+    Args:
+        objects: of the recording.
+        joints_m: (frame, joint, 3) joints of both hands in the world, NaN if a hand is not tracked.
+        camera_rotation: (frame, 3, 3) world from a head-worn camera with OpenCV axes.
     """
-    rests = [rest for thing in objects for rest in _rests(thing, joints_m, camera_rotation)]
-    clear = [rest for rest in rests if len(rest.ways) == 1]
+    rests = [
+        rest for tracked_object in objects for rest in _resting_intervals(tracked_object, joints_m, camera_rotation)
+    ]
+    unambiguous = [rest for rest in rests if len(rest.downs) == 1]
     if not rests:
         return GravityEstimate(None, "unknown: no object stands still with the hands away")
-    if _different(clear) < 2:
+    if _n_different_poses(unambiguous) < 2:
         return GravityEstimate(None, "unknown: no two objects, or turns of one, show on which side they stand")
-    if not any(rest.lifted for rest in clear):
+    if not any(rest.lifted for rest in unambiguous):
         return GravityEstimate(None, "unknown: no object is lifted from where it rests")
-    return _agreed(clear)
+    return _consensus(unambiguous)
 
 
-def _agreed(rests: list[_Rest]) -> GravityEstimate:
-    """The mean of the directions that agree, one vote per stretch; None when too many disagree."""
-    downs = np.concatenate([rest.ways for rest in rests])
+def _consensus(rests: list[_RestingInterval]) -> GravityEstimate:
+    """The mean of the largest set of directions within 7 degrees, one vote per interval."""
+    downs = np.concatenate([rest.downs for rest in rests])
     near = downs @ downs.T >= np.cos(AGREEMENT_RAD)
-    agree = near[int(near.sum(axis=1).argmax())]
-    chosen = [rest for rest, agrees in zip(rests, agree, strict=True) if agrees]
-    if agree.mean() < AGREEING_SHARE or _different(chosen) < 2:
-        return GravityEstimate(None, f"unknown: only {agree.sum()} of {len(rests)} resting stretches agree")
-    # Rounded, so that the last bits of a sum do not depend on the machine.
-    mean = np.round(downs[agree].mean(axis=0), 6) + 0.0
+    agreeing = near[int(near.sum(axis=1).argmax())]
+    chosen = [rest for rest, agrees in zip(rests, agreeing, strict=True) if agrees]
+    if agreeing.mean() < MIN_AGREEING_FRACTION or _n_different_poses(chosen) < 2:
+        return GravityEstimate(None, f"unknown: only {agreeing.sum()} of {len(rests)} resting stretches agree")
+    # Rounded, because the last bits of a sum depend on the processor.
+    mean = np.round(downs[agreeing].mean(axis=0), 6) + 0.0
     mean /= np.linalg.norm(mean)
-    spread = np.rad2deg(np.arccos(np.clip(downs[agree] @ mean, -1, 1)).max())
+    spread = np.rad2deg(np.arccos(np.clip(downs[agreeing] @ mean, -1, 1)).max())
     n_frames = sum(rest.n_frames for rest in chosen)
-    what = f"{n_frames} resting frames in {len(chosen)} stretches that agree within {max(spread, 0.1):.1f} degrees"
-    return GravityEstimate(mean, f"estimated from {what}")
+    evidence = f"{n_frames} resting frames in {len(chosen)} stretches that agree within {max(spread, 0.1):.1f} degrees"
+    return GravityEstimate(mean, f"estimated from {evidence}")
 
 
-def _rests(thing: TrackedObject, joints_m: np.ndarray, camera_rotation: np.ndarray) -> list[_Rest]:
-    if not len(thing.footing.downs):
+def _resting_intervals(
+    tracked_object: TrackedObject, joints_m: np.ndarray, camera_rotation: np.ndarray
+) -> list[_RestingInterval]:
+    if not len(tracked_object.footing.downs):
         return []
-    # Between the image's down and ahead: within 45 degrees of gravity while the head is upright.
+    # Halfway between the camera's down (y) and forward (z) axes: within 45 degrees of gravity if the head is upright.
     below_head = camera_rotation[:, :, 1:].sum(axis=2) / np.sqrt(2)
-    corners = np.array(list(product(*thing.footing.box_m.T)))
-    placed = corners @ thing.poses[:, :3, :3].transpose(0, 2, 1) + thing.poses[:, None, :3, 3]
-    scene = _Scene(thing, placed, joints_m, below_head)
+    corners = np.array(list(product(*tracked_object.footing.box_m.T)))
+    corners_world = corners @ tracked_object.poses[:, :3, :3].transpose(0, 2, 1) + tracked_object.poses[:, None, :3, 3]
+    scene = _Scene(tracked_object, corners_world, joints_m, below_head)
     rests = []
-    for start, stop in runs(thing.frames & _hands_away(thing, joints_m)):
+    for start, stop in runs(tracked_object.frames & _hands_away(tracked_object, joints_m)):
         middle = np.median(scene.corners[start:stop], axis=0)
-        off = np.linalg.norm(scene.corners[start:stop] - middle, axis=-1).max(axis=1)
-        still = start + np.flatnonzero(off < STILL_M)
-        if len(still) >= max(FEWEST_FRAMES, MOSTLY_STILL * (stop - start)):
-            rests.append(_rest(scene, still))
+        offset_m = np.linalg.norm(scene.corners[start:stop] - middle, axis=-1).max(axis=1)
+        still = start + np.flatnonzero(offset_m < STILL_M)
+        if len(still) >= max(MIN_FRAMES, MIN_STILL_FRACTION * (stop - start)):
+            rests.append(_resting_interval(scene, still))
     return rests
 
 
-def _rest(scene: _Scene, still: np.ndarray) -> _Rest:
-    """The directions down that neither the camera nor what happens around the stretch speaks against."""
+def _resting_interval(scene: _Scene, still: np.ndarray) -> _RestingInterval:
+    """Reject directions that contradict the camera or the motion around the interval. still: indices of frames."""
     corners = scene.corners[still].mean(axis=0)
-    turn = Rotation.from_matrix(scene.thing.poses[still, :3, :3]).mean().as_matrix()
-    # As far as the same object is tracked without a break.
-    first, last = next((a, b) for a, b in runs(scene.thing.frames) if a <= still[0] < b)
-    around = np.arange(max(first, still[0] - WATCHED_FRAMES), min(last, still[-1] + 1 + WATCHED_FRAMES))
-    near = scene.joints_m[around].reshape(-1, 3)
-    near = near[np.linalg.norm(near - corners.mean(axis=0), axis=1) < REACH_M + np.ptp(corners, axis=0).max() / 2]
+    rotation = Rotation.from_matrix(scene.tracked_object.poses[still, :3, :3]).mean().as_matrix()
+    # Restrict the context to frames of the same uninterrupted track.
+    first, last = next((a, b) for a, b in runs(scene.tracked_object.frames) if a <= still[0] < b)
+    around = np.arange(max(first, still[0] - CONTEXT_FRAMES), min(last, still[-1] + 1 + CONTEXT_FRAMES))
+    near_joints = scene.joints_m[around].reshape(-1, 3)
+    near_joints = near_joints[
+        np.linalg.norm(near_joints - corners.mean(axis=0), axis=1) < REACH_M + np.ptp(corners, axis=0).max() / 2
+    ]
     below_head = scene.below_head[still].mean(axis=0)
     possible, lifted = [], False
-    for down in scene.thing.footing.downs @ turn.T:
-        support_m = np.median(_depth_m(scene.thing, still, down))
-        depth_m = _depth_m(scene.thing, around, down) - support_m
-        reaching = (near @ down > support_m + BELOW_M).mean() if len(near) else 0.0
+    for down in scene.tracked_object.footing.downs @ rotation.T:
+        support_m = np.median(_depth_m(scene.tracked_object, still, down))
+        depth_m = _depth_m(scene.tracked_object, around, down) - support_m
+        reaching = (near_joints @ down > support_m + BELOW_SUPPORT_M).mean() if len(near_joints) else 0.0
         in_view = down @ below_head >= np.cos(CAMERA_CONE_RAD) * np.linalg.norm(below_head)
-        if in_view and depth_m.max() <= BELOW_M and reaching <= HANDS_BELOW:
+        if in_view and depth_m.max() <= BELOW_SUPPORT_M and reaching <= MAX_BELOW_FRACTION:
             possible.append(down)
             lifted |= bool(depth_m.min() < -LIFTED_M)
-    return _Rest(np.array(possible).reshape(-1, 3), corners, len(still), lifted)
+    return _RestingInterval(np.array(possible).reshape(-1, 3), corners, len(still), lifted)
 
 
-def _depth_m(thing: TrackedObject, frames: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """(frame,) how far along ``down`` the object reaches."""
-    turned = down @ thing.poses[frames, :3, :3]
-    return (turned @ thing.footing.outline_m.T).max(axis=1) + thing.poses[frames, :3, 3] @ down
+def _depth_m(tracked_object: TrackedObject, frames: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """(frame,) coordinate along ``down`` of the object's lowest point, metres."""
+    down_local = down @ tracked_object.poses[frames, :3, :3]
+    return (down_local @ tracked_object.footing.outline_m.T).max(axis=1) + tracked_object.poses[frames, :3, 3] @ down
 
 
-def _hands_away(thing: TrackedObject, joints_m: np.ndarray) -> np.ndarray:
-    """(frame,) bool: a hand is seen, and no joint of either is near the object's box."""
-    low, high = thing.footing.box_m
-    local = (joints_m - thing.poses[:, None, :3, 3]) @ thing.poses[:, :3, :3]
-    distance = np.linalg.norm(np.maximum(np.maximum(low - local, local - high), 0), axis=-1)
-    seen = np.isfinite(distance)
-    return seen.any(axis=1) & (np.where(seen, distance, np.inf) > NO_HAND_M).all(axis=1)
+def _hands_away(tracked_object: TrackedObject, joints_m: np.ndarray) -> np.ndarray:
+    """(frame,) bool: a hand is tracked, and no joint of either hand is near the object's box."""
+    low, high = tracked_object.footing.box_m
+    joints_local = (joints_m - tracked_object.poses[:, None, :3, 3]) @ tracked_object.poses[:, :3, :3]
+    distance = np.linalg.norm(np.maximum(np.maximum(low - joints_local, joints_local - high), 0), axis=-1)
+    has_joint = np.isfinite(distance)
+    return has_joint.any(axis=1) & (np.where(has_joint, distance, np.inf) > NO_HAND_M).all(axis=1)
 
 
-def _different(rests: Sequence[_Rest]) -> int:
-    """How many stretches differ in the object or its orientation: one that leans the same way twice proves nothing."""
-    kept: list[np.ndarray] = []
+def _n_different_poses(rests: Sequence[_RestingInterval]) -> int:
+    """Number of intervals that differ in object or orientation. Repeats of one resting pose are no evidence."""
+    shapes: list[np.ndarray] = []
     for rest in rests:
         shape = rest.corners - rest.corners.mean(axis=0)
-        if all(np.linalg.norm(shape - other, axis=1).max() > TURNED_M for other in kept):
-            kept.append(shape)
-    return len(kept)
+        if all(np.linalg.norm(shape - other, axis=1).max() > DIFFERENT_POSE_M for other in shapes):
+            shapes.append(shape)
+    return len(shapes)

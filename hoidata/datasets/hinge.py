@@ -1,4 +1,4 @@
-"""Two parts that were tracked one by one, as one object with a hinge."""
+"""Fits a hinge to two separately tracked parts and joins them to one articulated object."""
 
 from itertools import product
 from typing import NamedTuple
@@ -9,129 +9,162 @@ from hoidata.clips.quarantine import Quarantined
 from hoidata.geometry.rotations import rotation_angle, rotmat_to_rotvec
 from hoidata.objects.model import Hinge, ObjectModel
 
-ROUNDS = 3
-LEAST_KEPT = 0.95
-LEAST_TURN_RAD = np.deg2rad(15)  # parts that turn less against each other do not tell where their hinge is
+N_ITERATIONS = 3
+MIN_USED_FRACTION = 0.95
+MIN_ROTATION_RAD = np.deg2rad(15)  # a smaller relative rotation does not determine the hinge
 
 
 class HingeFit(NamedTuple):
-    """world_from_object (frame, 4, 4), hinge_rad (frame,), unwrapped.
+    """Poses of an articulated object that approximate two tracked parts."""
 
-    residual_m, residual_rad: (frame,) how far both parts lie from where they were tracked, root mean square over the
-    corners of their boxes, and how far their relative rotation is off the hinge.
-    """
+    world_from_object: np.ndarray  # (frame, 4, 4)
+    hinge_rad: np.ndarray  # (frame,) unwrapped
+    residual_m: np.ndarray  # (frame,) RMS distance of both parts' box corners from their tracked positions
+    residual_rad: np.ndarray  # (frame,) angle between the relative rotation and the hinge rotation
 
-    world_from_object: np.ndarray
-    hinge_rad: np.ndarray
-    residual_m: np.ndarray
-    residual_rad: np.ndarray
-
-    def off(self, most_mm: float, most_deg: float) -> np.ndarray:
-        """(frame,) bool: the parts lie farther than that from one hinge."""
+    def exceeds(self, most_mm: float, most_deg: float) -> np.ndarray:
+        """(frame,) bool: a residual is larger than the limit."""
         return (self.residual_m > most_mm / 1000) | (self.residual_rad > np.deg2rad(most_deg))
 
     @property
     def note(self) -> str:
-        """How well the parts keep to the hinge, in words."""
+        """The residuals in words."""
         mm, degrees = (np.percentile(v, 95) for v in (1000 * self.residual_m, np.rad2deg(self.residual_rad)))
         return f"hinge: {mm:.2f} mm and {degrees:.2f} degrees off in 95 % of frames"
 
-    def left_out(self, source_key: str, where: str, frames: np.ndarray, most_mm: int, most_deg: int) -> Quarantined:
-        """The frames of the source (frame,) in which the parts lie farther off, as one reason."""
-        far = frames[self.off(most_mm, most_deg)]
-        worst = f"up to {1000 * self.residual_m.max():.1f} mm and {np.rad2deg(self.residual_rad.max()):.1f} degrees"
+    def rejected_frames_reason(
+        self, source_key: str, location: str, frames: np.ndarray, most_mm: int, most_deg: int
+    ) -> Quarantined:
+        """One reason for the frames whose residuals exceed the limits. frames: (frame,) numbers in the source."""
+        rejected_frames = frames[self.exceeds(most_mm, most_deg)]
+        worst_error = (
+            f"up to {1000 * self.residual_m.max():.1f} mm and {np.rad2deg(self.residual_rad.max()):.1f} degrees"
+        )
         expected = f"both parts within {most_mm} mm and {most_deg} degrees of one hinge"
-        got = f"{worst} in {len(far)} frames, the first {far[0]}"
-        return Quarantined(source_key, where, expected, got, "nothing to do, or raise most_off_mm")
+        got = f"{worst_error} in {len(rejected_frames)} frames, the first {rejected_frames[0]}"
+        remedy = "nothing to do, or raise most_off_mm"
+        return Quarantined(source_key, where=location, expected=expected, got=got, remedy=remedy)
 
 
 def rigid_fit(from_m: np.ndarray, to_m: np.ndarray) -> np.ndarray:
-    """(frame, 4, 4) the turn and shift that take points (frame, point, 3) nearest to others (Kabsch 1976)."""
+    """Least-squares rigid transforms between corresponding points (Kabsch 1976).
+
+    Args:
+        from_m: (frame, point, 3).
+        to_m: (frame, point, 3).
+
+    Returns:
+        (frame, 4, 4) transforms that take ``from_m`` closest to ``to_m``.
+    """
     from_mean, to_mean = from_m.mean(axis=1, keepdims=True), to_m.mean(axis=1, keepdims=True)
     u, _, vt = np.linalg.svd((to_m - to_mean).transpose(0, 2, 1) @ (from_m - from_mean))
-    signs = np.ones((len(u), 3))
+    signs = np.ones((len(u), 3))  # excludes reflections
     signs[:, 2] = np.sign(np.linalg.det(u @ vt))
-    found = np.tile(np.eye(4), (len(u), 1, 1))
-    found[:, :3, :3] = (u * signs[:, None]) @ vt
-    found[:, :3, 3] = (to_mean - from_mean @ found[:, :3, :3].transpose(0, 2, 1))[:, 0]
-    return found
+    transforms = np.tile(np.eye(4), (len(u), 1, 1))
+    transforms[:, :3, :3] = (u * signs[:, None]) @ vt
+    transforms[:, :3, 3] = (to_mean - from_mean @ transforms[:, :3, :3].transpose(0, 2, 1))[:, 0]
+    return transforms
 
 
 def fit_hinge(base: np.ndarray, moving: np.ndarray, hinge: Hinge, corners_m: tuple[np.ndarray, np.ndarray]) -> HingeFit:
-    """One pose and one angle per frame for two parts that were tracked apart.
+    """Fit one object pose and one hinge angle per frame to two separately tracked parts.
 
-    base, moving: (frame, 4, 4) world from each part, in the coordinates of the whole object at rest. corners_m: (8, 3)
-    of each part's box there. The angle is that of the relative rotation about the axis; the pose is nearest to both
-    parts' corners; both in turn.
+    Alternates two steps: the angle of the relative rotation about the axis, and the pose closest to the corners of both
+    parts.
+
+    Args:
+        base: (frame, 4, 4) world from base, in the coordinates of the whole object at rest.
+        moving: (frame, 4, 4) world from moving part, in the same coordinates.
+        hinge: of the whole object.
+        corners_m: (8, 3) box corners of each part at rest.
     """
-    seen = np.concatenate([_moved(base, corners_m[0]), _moved(moving, corners_m[1])], axis=1)
+    tracked_m = np.concatenate([_transformed(base, corners_m[0]), _transformed(moving, corners_m[1])], axis=1)
     pose = base
-    for _ in range(ROUNDS):
+    for _ in range(N_ITERATIONS):
         angle = np.unwrap(_angle_about(hinge.axis, pose[:, :3, :3].transpose(0, 2, 1) @ moving[:, :3, :3]))
         rest = np.concatenate(
             [np.broadcast_to(corners_m[0], (len(base), 8, 3)), hinge.turn(angle) @ corners_m[1]], axis=1
         )
-        pose = rigid_fit(rest, seen)
-    off = np.linalg.norm(_moved(pose, rest) - seen, axis=2)
+        pose = rigid_fit(rest, tracked_m)
+    distance_m = np.linalg.norm(_transformed(pose, rest) - tracked_m, axis=2)
     relative = pose[:, :3, :3].transpose(0, 2, 1) @ moving[:, :3, :3]
-    left = hinge.turn(angle).rotation.transpose(0, 2, 1) @ relative
-    return HingeFit(pose, angle, np.sqrt((off**2).mean(axis=1)), rotation_angle(left))
+    residual_rotation = hinge.turn(angle).rotation.transpose(0, 2, 1) @ relative
+    return HingeFit(pose, angle, np.sqrt((distance_m**2).mean(axis=1)), rotation_angle(residual_rotation))
 
 
-def find_hinge(turned: np.ndarray) -> Hinge | None:
-    """The axis that the turns of a part against its base (frame, 4, 4) share; None where it turns too little to tell.
+def find_hinge(base_from_part: np.ndarray) -> Hinge | None:
+    """Estimate the common axis of a part's rotations relative to its base.
 
-    turned: base from the part as it lies at rest. The axis points the way of its largest component.
+    Args:
+        base_from_part: (frame, 4, 4), relative to the pose at rest.
+
+    Returns:
+        The hinge, whose axis has a positive largest component; None if the part rotates by less than 15 degrees.
     """
-    rotvec = rotmat_to_rotvec(turned[:, :3, :3])
+    rotvec = rotmat_to_rotvec(base_from_part[:, :3, :3])
     axis = np.linalg.eigh(rotvec.T @ rotvec)[1][:, -1]
     axis *= np.sign(axis[np.abs(axis).argmax()])
-    if np.ptp(np.unwrap(_angle_about(axis, turned[:, :3, :3]))) < LEAST_TURN_RAD:
+    if np.ptp(np.unwrap(_angle_about(axis, base_from_part[:, :3, :3]))) < MIN_ROTATION_RAD:
         return None
-    plane = np.linalg.svd(axis[None])[2][1:].T  # (3, 2): along the axis its origin may lie anywhere
-    ways = (np.eye(3) - turned[:, :3, :3]) @ plane
-    place = np.linalg.lstsq(ways.reshape(-1, 2), turned[:, :3, 3].reshape(-1), rcond=None)[0]
-    return Hinge(axis, plane @ place)
+    # Points on the axis are fixed: (I - R) origin = t. The origin is unique only in the plane normal to the axis.
+    plane = np.linalg.svd(axis[None])[2][1:].T  # (3, 2)
+    displacement = (np.eye(3) - base_from_part[:, :3, :3]) @ plane
+    origin = np.linalg.lstsq(displacement.reshape(-1, 2), base_from_part[:, :3, 3].reshape(-1), rcond=None)[0]
+    return Hinge(axis, plane @ origin)
 
 
 def hinge_between(
-    base: np.ndarray, turned: np.ndarray, corners_m: tuple[np.ndarray, np.ndarray], most_mm: int, most_deg: int
+    base: np.ndarray, base_from_part: np.ndarray, corners_m: tuple[np.ndarray, np.ndarray], most_mm: int, most_deg: int
 ) -> tuple[Hinge, HingeFit] | None:
-    """The hinge of two parts that were tracked apart; None where they turn too little, or keep to none.
+    """Estimate the hinge between two separately tracked parts.
 
-    base: (frame, 4, 4) world from the base; turned: (frame, 4, 4) base from the other part as it lies at rest;
-    corners_m: (8, 3) of each part's box at rest. Frames farther off than ``most_mm`` or ``most_deg`` are found out
-    and have no say; of more than 5 % the parts have no hinge.
+    Frames whose residuals exceed the limits are excluded from a second estimate.
+
+    Args:
+        base: (frame, 4, 4) world from base.
+        base_from_part: (frame, 4, 4), relative to the pose at rest.
+        corners_m: (8, 3) box corners of each part at rest.
+        most_mm: limit of the position residual.
+        most_deg: limit of the rotation residual.
+
+    Returns:
+        Hinge and fit. None if the parts rotate too little, or if more than 5 % of the frames exceed a limit.
     """
-    kept = np.ones(len(base), bool)
+    used_frames = np.ones(len(base), bool)
     for _ in range(2):
-        hinge = find_hinge(turned[kept]) if kept.any() else None
+        hinge = find_hinge(base_from_part[used_frames]) if used_frames.any() else None
         if hinge is None:
             return None
-        fit = fit_hinge(base, base @ turned, hinge, corners_m)
-        kept = ~fit.off(most_mm, most_deg)
-    return (hinge, fit) if kept.mean() >= LEAST_KEPT else None
+        fit = fit_hinge(base, base @ base_from_part, hinge, corners_m)
+        used_frames = ~fit.exceeds(most_mm, most_deg)
+    return (hinge, fit) if used_frames.mean() >= MIN_USED_FRACTION else None
 
 
 def hinged_model(name: str, vertices_m: list[np.ndarray], faces: list[np.ndarray], hinge: Hinge) -> ObjectModel:
-    """Two meshes as one object at rest, the base first."""
-    counts = [len(own) for own in vertices_m]
+    """Join two meshes to one object at rest. The base is the first mesh."""
+    counts = [len(vertices) for vertices in vertices_m]
     part = np.repeat(np.array([0, 1], np.uint8), counts)
-    return ObjectModel(name, np.concatenate(vertices_m), np.concatenate([faces[0], faces[1] + counts[0]]), part, hinge)
+    return ObjectModel(
+        name=name,
+        vertices_m=np.concatenate(vertices_m),
+        faces=np.concatenate([faces[0], faces[1] + counts[0]]),
+        part=part,
+        hinge=hinge,
+    )
 
 
 def box_corners(points_m: np.ndarray) -> np.ndarray:
-    """(8, 3) of the box around points (point, 3)."""
+    """(8, 3) corners of the bounding box of points (point, 3)."""
     return np.array(list(product(*np.stack([points_m.min(axis=0), points_m.max(axis=0)]).T)))
 
 
-def _moved(transforms: np.ndarray, points_m: np.ndarray) -> np.ndarray:
+def _transformed(transforms: np.ndarray, points_m: np.ndarray) -> np.ndarray:
     return points_m @ transforms[:, :3, :3].transpose(0, 2, 1) + transforms[:, None, :3, 3]
 
 
 def _angle_about(axis: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """(frame,) angle about the unit axis whose rotation is nearest to each of (frame, 3, 3)."""
-    way = np.stack(
+    """(frame,) angle of the rotation about the unit axis that is closest to each rotation (frame, 3, 3)."""
+    sine_axis = np.stack(
         [
             rotation[:, 2, 1] - rotation[:, 1, 2],
             rotation[:, 0, 2] - rotation[:, 2, 0],
@@ -140,4 +173,4 @@ def _angle_about(axis: np.ndarray, rotation: np.ndarray) -> np.ndarray:
         axis=1,
     )
     along = np.einsum("i,fij,j->f", axis, rotation, axis)
-    return np.arctan2(way @ axis, np.trace(rotation, axis1=1, axis2=2) - along)
+    return np.arctan2(sine_axis @ axis, np.trace(rotation, axis1=1, axis2=2) - along)

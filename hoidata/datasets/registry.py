@@ -1,7 +1,7 @@
-"""Which adapters there are: one per dataset folder, and those other packages register.
+"""Finds adapters: one per dataset folder, and those that other packages register.
 
-A folder of hoidata/datasets, or one the user lists (see ``hoidata.dataset_folders``), is a dataset: its ``adapter.py``
-holds one class whose name ends in ``Adapter``. A package adds one with an entry point::
+Dataset folders are in hoidata/datasets or listed by the user (see ``hoidata.dataset_folders``). Their ``adapter.py``
+has one class whose name ends in ``Adapter``. A package registers an adapter with an entry point::
 
     [project.entry-points."hoidata.adapters"]
     kitchen = "kitchen_hoi:KitchenAdapter"
@@ -19,62 +19,63 @@ from hoidata.datasets.base import Adapter
 from hoidata.errors import BadInput, MissingResource
 
 ENTRY_POINT_GROUP = "hoidata.adapters"
-# What an adapter states about its dataset; its other fields are settings.
+# Properties that state facts about the dataset; the other fields of an adapter are settings.
 FACTS = tuple(name for name, value in vars(Adapter).items() if isinstance(value, property))
 
 
 @dataclass(frozen=True)
 class Registered:
-    """One known adapter. origin: "built in", the user's folder, or the package and version that registers it.
-
-    settings: the fields that may be given to ``get_adapter``, with their defaults. adapter: one with these defaults,
-    or None with the ``problem`` that kept it from being made.
-    """
+    """An adapter with its settings, or the problem that prevents creating it."""
 
     name: str
-    origin: str
-    settings: dict[str, Any]
-    adapter: Adapter | None
+    origin: str  # "built in", the user's folder, or the package and version that registers it
+    settings: dict[str, Any]  # arguments of ``get_adapter`` with their defaults
+    adapter: Adapter | None  # with default settings; None if there is a problem
     problem: str = ""
 
 
 def adapter_names() -> list[str]:
-    """Names of all known adapters: built-in ones, then those of the user's folders, then those of other packages."""
-    return [*built_in_names(), *sorted(outside_folders()), *sorted({point.name for point in _added()})]
+    """Names of all adapters: built in, then from the user's folders, then from other packages."""
+    return [*built_in_names(), *sorted(outside_folders()), *sorted({point.name for point in _foreign_entry_points()})]
 
 
 def registered_adapters() -> list[Registered]:
-    """All known adapters in that order; one that cannot be made is listed with its problem."""
+    """All adapters in the order of ``adapter_names``, with the problem of each that cannot be created."""
     return [_registered(name) for name in adapter_names()]
 
 
 def get_adapter(name: str, **settings: Any) -> Adapter:
-    """A new adapter of that name.
+    """Create the adapter of a dataset.
 
-    settings: values for the fields of the adapter's dataclass that are no facts. Raises MissingResource naming the
-    known adapters or the package that is broken, and BadInput naming the known settings.
+    Args:
+        name: of the dataset.
+        settings: values of the adapter's dataclass fields; fields that state facts are excluded.
+
+    Raises:
+        MissingResource: there is no such adapter, or its package is broken.
+        BadInput: the adapter has no such setting.
     """
-    kind = _kind(name)
-    known = _settings(kind)
-    unknown = sorted(set(settings) - set(known))
+    kind = _adapter_class(name)
+    defaults = _settings(kind)
+    unknown = sorted(set(settings) - set(defaults))
     if unknown:
-        expected = f"some of {', '.join(known)}" if known else "none: it has no settings"
+        expected = f"some of {', '.join(defaults)}" if defaults else "none: it has no settings"
         raise BadInput(f"settings of the adapter {name}", expected, ", ".join(unknown), "correct it")
     return kind(**settings)
 
 
 def _registered(name: str) -> Registered:
-    packages = ", ".join(_package(point) for point in _added() if point.name == name)
+    packages = ", ".join(_package(point) for point in _foreign_entry_points() if point.name == name)
     origin = "built in" if name in built_in_names() else packages or str(outside_folders()[name])
     try:
-        kind = _kind(name)
+        kind = _adapter_class(name)
         return Registered(name, origin, _settings(kind), kind())
-    except Exception as error:  # a broken package of others must not hide the adapters that work
-        return Registered(name, origin, {}, None, str(error))
+    except Exception as error:  # a broken package must not hide the working adapters
+        return Registered(name, origin, settings={}, adapter=None, problem=str(error))
 
 
-def _added() -> list[EntryPoint]:
-    """Entry points of other packages; the name of a folder cannot be taken over."""
+def _foreign_entry_points() -> list[EntryPoint]:
+    """Entry points of other packages. A package cannot replace a dataset that has a folder."""
     return [point for point in entry_points(group=ENTRY_POINT_GROUP) if dataset_folder(point.name) is None]
 
 
@@ -88,10 +89,10 @@ def _settings(kind: Any) -> dict[str, Any]:
     return {field.name: field.default for field in fields(kind) if field.init and field.name not in FACTS}
 
 
-def _kind(name: str) -> Any:
+def _adapter_class(name: str) -> Any:
     if dataset_folder(name) is not None:
-        return _kind_of_folder(name)
-    points = [point for point in _added() if point.name == name]
+        return _class_in_folder(name)
+    points = [point for point in _foreign_entry_points() if point.name == name]
     if not points:
         raise MissingResource(f"there is no adapter {name!r}; known ones: {', '.join(adapter_names())}")
     if len(points) > 1:
@@ -101,26 +102,26 @@ def _kind(name: str) -> Any:
         )
     try:
         return points[0].load()
-    except Exception as error:  # importing a package of others can raise anything
+    except Exception as error:  # importing foreign code can raise anything
         text = f"{type(error).__name__}: {error}"
         raise MissingResource(f"the adapter {name!r} of {_package(points[0])} cannot be imported: {text}") from error
 
 
-def _kind_of_folder(name: str) -> type:
+def _class_in_folder(name: str) -> type:
     """The one adapter class of a dataset's folder."""
-    room, above = sys.modules["hoidata.datasets"].__path__, str(Path(str(dataset_folder(name))).parent)
-    if above not in room:  # named since this process imported the room
-        room.append(above)
+    search_path, parent = sys.modules["hoidata.datasets"].__path__, str(Path(str(dataset_folder(name))).parent)
+    if parent not in search_path:  # the user listed the folder after this process imported hoidata.datasets
+        search_path.append(parent)
     try:
         module = import_module(f"hoidata.datasets.{name}.adapter")
     except BadInput:
         raise
-    except Exception as error:  # so can importing a folder of the user's own
+    except Exception as error:  # importing a user's folder can raise anything
         text = f"{type(error).__name__}: {error}"
         raise MissingResource(f"the adapter in {dataset_folder(name)} cannot be imported: {text}") from error
-    kinds = [kind for kind in vars(module).values() if isinstance(kind, type) and kind.__module__ == module.__name__]
-    found = [kind for kind in kinds if kind.__name__.endswith("Adapter")]
-    if len(found) != 1:
-        names = ", ".join(kind.__name__ for kind in found) or "none"
+    classes = [kind for kind in vars(module).values() if isinstance(kind, type) and kind.__module__ == module.__name__]
+    adapters = [kind for kind in classes if kind.__name__.endswith("Adapter")]
+    if len(adapters) != 1:
+        names = ", ".join(kind.__name__ for kind in adapters) or "none"
         raise BadInput(f"{module.__file__}", "one class whose name ends in Adapter", names, "rename the others")
-    return found[0]
+    return adapters[0]

@@ -1,5 +1,6 @@
 """Intervals of a recording in which something holds, and steps that stand out from the motion around them."""
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -49,3 +50,10 @@ def sudden_steps(step: np.ndarray, notable: float, large: float, ratio: float, n
     padded = np.pad(step, neighbours, mode="reflect" if len(step) > neighbours else "edge")
     around = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * neighbours + 1), axis=1)
     return (step > large) | ((step > notable) & (step > ratio * around))
+
+
+def split_evenly(interval: Interval, longest: int) -> list[Interval]:
+    """Split an interval into the fewest intervals of at most ``longest`` frames, about equally long."""
+    n_parts = -(-(interval.stop - interval.start) // longest)
+    edges = np.linspace(interval.start, interval.stop, n_parts + 1).round().astype(int).tolist()
+    return [Interval(start, stop) for start, stop in pairwise(edges)]

@@ -87,7 +87,7 @@ def _require_parts(adapter, root: Path, also: str = "") -> None:
     missing = missing_parts(adapter, root)
     required = [part for part in missing if not part.optional]
     if required or not adapter.sequences(root):
-        what = "; ".join(f"{part.what} ({part.patterns[0]}, from {part.where})" for part in required)
+        what = "; ".join(f"{part.contents} ({part.patterns[0]}, from {part.archive})" for part in required)
         got = f"no {what}" if what else "none"
         remedy = f"give the folder that {adapter.name} unpacks to; register at {adapter.where_to_register}"
         if settings := {part.unneeded_with for part in required if part.unneeded_with}:
@@ -97,7 +97,7 @@ def _require_parts(adapter, root: Path, also: str = "") -> None:
         remedy += f". Besides, {also}" if also else ""
         raise BadInput(root, f"sequences of {adapter.name}", got, remedy)
     for part in missing:
-        typer.echo(f"{adapter.name}: without {part.what} ({part.patterns[0]}), to be had from {part.where}")
+        typer.echo(f"{adapter.name}: without {part.contents} ({part.patterns[0]}), to be had from {part.archive}")
 
 
 def _scan_hand(paths, root: Path):
@@ -159,7 +159,7 @@ def _say_where_to_get(adapter) -> None:
         optional = " (optional)" if part.optional else ""
         if part.unneeded_with and not part.optional:
             optional = f" (not needed with the setting {part.unneeded_with})"
-        typer.echo(f"  missing: {part.what} ({part.patterns[0]}), from {part.where}{optional}")
+        typer.echo(f"  missing: {part.contents} ({part.patterns[0]}), from {part.archive}{optional}")
     typer.echo(f"  once you have it: hoidata raw scan {adapter.name} --root FOLDER")
 
 
@@ -167,4 +167,4 @@ def _where_to_get(adapter, path: str) -> str:
     from pipelines.lineage.manifests import part_of
 
     part = part_of(adapter, path)
-    return f" ({part.what}, from {part.where})" if part else f" ({adapter.where_to_register})"
+    return f" ({part.contents}, from {part.archive})" if part else f" ({adapter.where_to_register})"

@@ -145,7 +145,7 @@ def missing_parts(adapter: Adapter, root: Path) -> list[DatasetPart]:
 
 def part_of(adapter: Adapter, path: str) -> DatasetPart | None:
     """The part of the dataset a manifest entry belongs to; a folder of frame files is known by its files."""
-    return next((part for part in adapter.parts if part.holds(path)), None)
+    return next((part for part in adapter.parts if part.matches(path)), None)
 
 
 @dataclass(frozen=True)

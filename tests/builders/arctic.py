@@ -1,4 +1,4 @@
-"""One ARCTIC recording, its object and its description, written by hand: 70 frames whose numbers are all known."""
+"""One ARCTIC recording, its object and its description, written by hand: 70 frames of known numbers."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ SHAPE = {
 }
 HAND_TRANSL = {"left": (0.2, -0.1, 0.8), "right": (-0.1, 0.1, 0.9)}
 HAND_ORIENT = {"left": (0.4, -1.0, 0.3), "right": (-0.7, 0.2, 1.9)}
-# Relative to the mean pose; the middle finger is turned by more than pi, as it occurs in the real files.
+# Relative to the mean pose; the middle finger rotates by more than pi, as in some released files.
 STORED = np.array([0.1, -0.2, 0.4, *[0.0] * 6, 4.6, 0.8, 0.3, *[0.0] * 33])
 LINES = """1-20 grab, left hand
 
@@ -73,7 +73,7 @@ def write_two(root: Path) -> Path:
 
 
 def head() -> dict:
-    """The camera on the head, from world to camera; it turns and moves."""
+    """The head camera, camera from world; it rotates and moves."""
     rotation = Rotation.from_rotvec(np.stack([1.8 + 0 * TIME, 0.01 * TIME, 0.2 + 0 * TIME], axis=1)).as_matrix()
     shift = np.stack([0.1 + 0.002 * TIME, -0.2 + 0 * TIME, 1.5 + 0 * TIME], axis=1)
     return {

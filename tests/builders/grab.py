@@ -1,4 +1,4 @@
-"""One GRAB recording and its meshes, written by hand: a sequence of 61 frames whose numbers are all known."""
+"""One GRAB recording and its meshes, written by hand: a sequence of 61 frames of known numbers."""
 
 import shutil
 from pathlib import Path
@@ -82,14 +82,14 @@ def write_root(root: Path) -> Path:
 
 
 def write_two(root: Path) -> Path:
-    """The sequence, and another one of a cube with a mesh of its own."""
+    """The sequence, and one of another cube."""
     write_root(root)
     first = root / "grab/s3/cubelarge_offhand_1.npz"
-    kept = first.read_bytes()
+    first_bytes = first.read_bytes()
     data = sequence() | {"obj_name": "cubesmall"}
     data["object"]["object_mesh"] = data["object"]["object_mesh"].replace("large", "small")
     write_sequence(root, data).rename(root / "grab/s3/cubesmall_offhand_1.npz")
-    first.write_bytes(kept)
+    first.write_bytes(first_bytes)
     meshes = root / "tools/object_meshes/contact_meshes"
     shutil.copy(meshes / "cubelarge.ply", meshes / "cubesmall.ply")
     return root

@@ -1,4 +1,4 @@
-"""One H2O sequence written by hand: a tree of text files, a head that turns and walks, a hand that takes chips."""
+"""One H2O sequence written by hand: text files of a moving head camera and a hand that takes chips."""
 
 import shutil
 from pathlib import Path
@@ -15,7 +15,7 @@ INDEX_BEND = (0.0, 0.1, 0.7)
 
 
 def camera(frame: int) -> np.ndarray:
-    """Camera to world: a head that turns and walks."""
+    """World from camera: a head that rotates and moves."""
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_euler("zyx", [20 + 3 * frame, 10, -110], degrees=True).as_matrix()
     matrix[:3, 3] = (0.1 + 0.01 * frame, -0.2, 1.5 - 0.005 * frame)
@@ -39,7 +39,7 @@ def write_text(path: Path, numbers) -> None:
 
 
 def write_root(root: Path) -> Path:
-    """One sequence; the right index bends at its first joint; the left hand is unknown in frame 5."""
+    """One sequence; the right index bends at its first joint; the left hand is not annotated in frame 5."""
     fingers = np.zeros(45)
     fingers[:3] = INDEX_BEND
     folder = root / "subject2" / "k1" / "3" / "cam4"

@@ -1,6 +1,6 @@
-"""HOI4D recordings written as the format notes have them, from a truth in the world: JSON, text and Python 2 pickles.
+"""Writes HOI4D recordings from a ground truth in the world: JSON, text and Python 2 pickles.
 
-Nothing of the adapter is used: rotations are SciPy's, pickles are written opcode by opcode.
+Independent of the adapter: rotations are SciPy's, pickles are written opcode by opcode.
 """
 
 import json
@@ -32,25 +32,21 @@ def key_of(name: str) -> SequenceKey:
 
 @dataclass(frozen=True)
 class Recording:
-    """A truth in the world, and how it is written.
-
-    parts: meshes of the whole object at rest, base first. camera, pose: (frame, 4, 4) world from camera and object.
-    angle: (frame,) radians about ``axis`` through ``origin``. own: by part the turn of its own mesh. hands: per side
-    (orient (frame, 3), 45 finger angles, wrist (frame, 3), 10 betas). events: (word, first, stop) in frames.
-    """
+    """A ground truth in the world, and options of the file format."""
 
     name: str
     folder: str
-    parts: list[trimesh.Trimesh]
+    parts: list[trimesh.Trimesh]  # of the whole object at rest, base first
     labels: tuple[str, ...]
-    camera: np.ndarray
-    pose: np.ndarray
-    angle: np.ndarray
+    camera: np.ndarray  # (frame, 4, 4) world from camera
+    pose: np.ndarray  # (frame, 4, 4) world from object
+    angle: np.ndarray  # (frame,) radians about ``axis`` through ``origin``
     axis: np.ndarray
     origin: np.ndarray
-    own: tuple[Rotation, ...]
+    box_rotations: tuple[Rotation, ...]  # object from box, per part
+    # Per side: orientation (frame, 3), 45 finger angles, wrist (frame, 3), 10 betas.
     hands: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]
-    events: tuple[tuple[str, int, int], ...]
+    events: tuple[tuple[str, int, int], ...]  # word, first frame, stop frame
     padded: bool = False
     hand_folder: str = "handpose/refinehandpose_{}"
     clock_s: float = 20.0
@@ -64,18 +60,18 @@ class Recording:
         return len(self.parts) == 2
 
 
-def transforms(turns: Rotation, places) -> np.ndarray:
-    found = np.tile(np.eye(4), (len(places), 1, 1))
-    found[:, :3, :3], found[:, :3, 3] = turns.as_matrix(), places
-    return found
+def transforms(turns: Rotation, positions_m) -> np.ndarray:
+    result = np.tile(np.eye(4), (len(positions_m), 1, 1))
+    result[:, :3, :3], result[:, :3, 3] = turns.as_matrix(), positions_m
+    return result
 
 
 def moving_camera(n_frames: int, seed: int) -> np.ndarray:
-    """A head that looks ahead and down, and turns while it goes."""
+    """World from a camera that looks ahead and down, and rotates while it moves."""
     random, time = np.random.default_rng(seed), np.linspace(0, 1, n_frames)[:, None]
     ahead = Rotation.from_matrix(np.array([[1, 0, 0], [0, -0.6, -0.8], [0, 0.8, -0.6]]).T)
-    turn = Rotation.from_rotvec(time * random.normal(0, 0.3, 3)) * ahead
-    return transforms(turn, np.array([0.1, -0.2, 0.4]) + time * random.normal(0, 0.2, 3))
+    rotation = Rotation.from_rotvec(time * random.normal(0, 0.3, 3)) * ahead
+    return transforms(rotation, np.array([0.1, -0.2, 0.4]) + time * random.normal(0, 0.2, 3))
 
 
 def box(size, middle) -> trimesh.Trimesh:
@@ -83,20 +79,21 @@ def box(size, middle) -> trimesh.Trimesh:
 
 
 def hand_of(side: str, pose: np.ndarray, offset, random) -> tuple:
-    turn = Rotation.from_matrix(pose[:, :3, :3]) * Rotation.from_rotvec(random.normal(0, 0.5, 3))
+    rotation = Rotation.from_matrix(pose[:, :3, :3]) * Rotation.from_rotvec(random.normal(0, 0.5, 3))
     wrist = pose[:, :3, :3] @ np.array(offset) + pose[:, :3, 3]
-    return turn.as_rotvec(), HANDS[side].mean_pose + random.normal(0, 0.2, 45), wrist, random.normal(0, 0.5, 10)
+    return rotation.as_rotvec(), HANDS[side].mean_pose + random.normal(0, 0.2, 45), wrist, random.normal(0, 0.5, 10)
 
 
 def recording(name: str, seed: int, n_frames: int = N_FRAMES, **changes) -> Recording:
-    """The safe, the scissors or the mug, both hands beside it."""
+    """The safe, the scissors or the mug, with a hand on each side."""
     random, time = np.random.default_rng(seed), np.linspace(0, 1, n_frames)[:, None]
-    turn = Rotation.from_rotvec(random.normal(0, 0.5, 3) + time * random.normal(0, 0.6, 3))
-    pose = transforms(turn, np.array([0.2, 0.5, 0.1]) + time * random.normal(0, 0.2, 3))
+    rotation = Rotation.from_rotvec(random.normal(0, 0.5, 3) + time * random.normal(0, 0.6, 3))
+    pose = transforms(rotation, np.array([0.2, 0.5, 0.1]) + time * random.normal(0, 0.2, 3))
     hands = {s: hand_of(s, pose, (0.2 if s == "right" else -0.2, 0, 0.1), random) for s in SIDES}
     shared = {
         "name": name, "camera": moving_camera(n_frames, seed), "pose": pose, "hands": hands,
-        "angle": 2.5 + 1.5 * np.sin(2 * time[:, 0]), "own": tuple(Rotation.from_rotvec(random.normal(0, 1, (2, 3)))),
+        "angle": 2.5 + 1.5 * np.sin(2 * time[:, 0]),
+        "box_rotations": tuple(Rotation.from_rotvec(random.normal(0, 1, (2, 3)))),
     }  # fmt: skip
     if name == SAFE:
         parts = [box((0.3, 0.25, 0.35), (0, 0, 0)), box((0.28, 0.02, 0.3), (0.01, -0.14, 0))]
@@ -116,22 +113,22 @@ def recording(name: str, seed: int, n_frames: int = N_FRAMES, **changes) -> Reco
     return replace(Recording(parts=parts, **shared, **facts), **changes)
 
 
-def write_recording(root: Path, made: Recording) -> Path:
-    folder = root / ANNOTATIONS / made.name
+def write_recording(root: Path, truth: Recording) -> Path:
+    folder = root / ANNOTATIONS / truth.name
     for name in ("objpose", "action", "3Dseg"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    _write_models(root, made)
-    _write_camera(folder / "3Dseg/output.log", made.camera)
-    _write_events(folder / "action/color.json", made)
-    boxes = _boxes(made)
-    for frame in range(len(made.pose)):
-        entries = [_entry(made, number, boxes[number], frame) for number in range(len(made.parts))]
-        name = "objects" if frame == made.objects_at else "dataList"
+    _write_models(root, truth)
+    _write_camera(folder / "3Dseg/output.log", truth.camera)
+    _write_events(folder / "action/color.json", truth)
+    boxes = _boxes(truth)
+    for frame in range(len(truth.pose)):
+        entries = [_entry(truth, number, boxes[number], frame) for number in range(len(truth.parts))]
+        name = "objects" if frame == truth.objects_at else "dataList"
         value = {"frameId": 1, "filePath": f"align_rgb/{frame:05d}.jpg", "isEffective": 1, name: entries[::-1]}
-        stem = f"{frame:05d}" if made.padded else f"{frame}"
+        stem = f"{frame:05d}" if truth.padded else f"{frame}"
         (folder / f"objpose/{stem}.json").write_text(json.dumps(value))
     for side in SIDES:
-        _write_hand(root / made.hand_folder.format(side) / made.name, made, side)
+        _write_hand(root / truth.hand_folder.format(side) / truth.name, truth, side)
     return root
 
 
@@ -143,26 +140,28 @@ def write_two(root: Path) -> Path:
     return root
 
 
-def _boxes(made: Recording) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Of each part: the middle of its own box in the whole object, and its extents, along its own axes."""
-    found = []
-    for part, own in zip(made.parts, made.own, strict=False):
-        turned = own.inv().apply(part.vertices)
-        found.append((own.apply((turned.min(axis=0) + turned.max(axis=0)) / 2), np.ptp(turned, axis=0)))
-    return found
+def _boxes(truth: Recording) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Centre in the whole object and extents of each part's box."""
+    result = []
+    for part, box_rotation in zip(truth.parts, truth.box_rotations, strict=False):
+        rotated = box_rotation.inv().apply(part.vertices)
+        result.append((box_rotation.apply((rotated.min(axis=0) + rotated.max(axis=0)) / 2), np.ptp(rotated, axis=0)))
+    return result
 
 
-def _entry(made: Recording, number: int, middle_and_size, frame: int) -> dict:
-    middle, size = middle_and_size
-    turn = Rotation.from_rotvec(made.axis * made.angle[frame] * (number == 1))
-    place = turn.apply(middle - made.origin) + made.origin
-    world = Rotation.from_matrix(made.pose[frame, :3, :3]) * turn * made.own[number]
-    camera = Rotation.from_matrix(made.camera[frame, :3, :3])
-    centre = camera.inv().apply(made.pose[frame, :3, :3] @ place + made.pose[frame, :3, 3] - made.camera[frame, :3, 3])
+def _entry(truth: Recording, number: int, centre_and_extents, frame: int) -> dict:
+    middle, size = centre_and_extents
+    rotation = Rotation.from_rotvec(truth.axis * truth.angle[frame] * (number == 1))
+    position_m = rotation.apply(middle - truth.origin) + truth.origin
+    world = Rotation.from_matrix(truth.pose[frame, :3, :3]) * rotation * truth.box_rotations[number]
+    camera = Rotation.from_matrix(truth.camera[frame, :3, :3])
+    centre = camera.inv().apply(
+        truth.pose[frame, :3, :3] @ position_m + truth.pose[frame, :3, 3] - truth.camera[frame, :3, 3]
+    )
     x, y, z = (camera.inv() * world).as_euler("XYZ")
     return {
         "id": number + 1,
-        "label": made.labels[number],
+        "label": truth.labels[number],
         "center": dict(zip("xyz", centre.tolist(), strict=True)),
         "dimensions": {"height": 1.02 * size[2], "length": 1.02 * size[0], "width": 1.02 * size[1]},
         "rotation": {"x": x, "y": y, "z": z},
@@ -171,21 +170,28 @@ def _entry(made: Recording, number: int, middle_and_size, frame: int) -> dict:
     }
 
 
-def _write_models(root: Path, made: Recording) -> None:
-    number = f"{int(made.name.split('/')[3][1:]):03d}"
-    if not made.hinged:
-        (middle, _), part = _boxes(made)[0], made.parts[0]
+def _write_models(root: Path, truth: Recording) -> None:
+    number = f"{int(truth.name.split('/')[3][1:]):03d}"
+    if not truth.hinged:
+        (middle, _), part = _boxes(truth)[0], truth.parts[0]
         write_obj(
-            root / MODELS / "rigid" / made.folder / f"{number}.obj",
-            made.own[0].inv().apply(part.vertices - middle),
+            root / MODELS / "rigid" / truth.folder / f"{number}.obj",
+            truth.box_rotations[0].inv().apply(part.vertices - middle),
             part,
         )
         return
-    folder = root / MODELS / "articulated" / made.folder / number
-    for place, (part, own, (middle, _)) in enumerate(zip(made.parts, made.own, _boxes(made), strict=True)):
-        write_obj(folder / f"objs/new-{1 - place}.obj", part.vertices, part)
-        write_obj(folder / f"objs/new-{1 - place}-align.obj", own.inv().apply(part.vertices - middle), part)
-    leaves = [{"id": 5 + place, "name": f"part {place}", "text": "", "objs": [f"new-{1 - place}"]} for place in (0, 1)]
+    folder = root / MODELS / "articulated" / truth.folder / number
+    for part_number, (part, box_rotation, (middle, _)) in enumerate(
+        zip(truth.parts, truth.box_rotations, _boxes(truth), strict=True)
+    ):
+        write_obj(folder / f"objs/new-{1 - part_number}.obj", part.vertices, part)
+        write_obj(
+            folder / f"objs/new-{1 - part_number}-align.obj", box_rotation.inv().apply(part.vertices - middle), part
+        )
+    leaves = [
+        {"id": 5 + part_number, "name": f"part {part_number}", "text": "", "objs": [f"new-{1 - part_number}"]}
+        for part_number in (0, 1)
+    ]
     tree = [{"id": 1, "name": "whole", "text": "whole", "objs": [], "children": leaves}]
     (folder / "result.json").write_text(json.dumps(tree), encoding="utf-8")
     nodes = [
@@ -196,7 +202,7 @@ def _write_models(root: Path, made: Recording) -> None:
         {
             "id": 1, "parent": 0, "joint": REVOLUTE, "name": "b", "parts": [{"id": 6, "name": "b", "children": []}],
             "jointData": {
-                "axis": {"origin": made.origin.tolist(), "direction": (2 * made.axis).tolist()},
+                "axis": {"origin": truth.origin.tolist(), "direction": (2 * truth.axis).tolist()},
                 "limit": {"a": 0, "b": -104.76, "noLimit": False},
             },
         },
@@ -212,33 +218,33 @@ def write_obj(path: Path, vertices: np.ndarray, mesh: trimesh.Trimesh) -> None:
 
 def _write_camera(path: Path, poses: np.ndarray) -> None:
     blocks = [
-        f"{n} {n} {n + 1}\n" + "\n".join(" ".join(map(repr, row)) for row in pose.tolist())
+        f"{n} {n} {n + 1}\n" + "\n".join(" ".join(map(repr, matrix_row)) for matrix_row in pose.tolist())
         for n, pose in enumerate(poses)
     ]
     path.write_text("\n".join(blocks) + "\n")
 
 
-def _write_events(path: Path, made: Recording) -> None:
-    seconds = made.clock_s / 300
-    length = {("Duration" if made.marks else "duration"): made.clock_s} if made.says_length else {}
-    names = ("hdTimeStart", "hdTimeEnd") if made.marks else ("startTime", "endTime")
-    items = [{"event": word, names[0]: start * seconds, names[1]: stop * seconds} for word, start, stop in made.events]
-    value = {"info": length, **({"markResult": {"marks": items}} if made.marks else {"events": items})}
+def _write_events(path: Path, truth: Recording) -> None:
+    seconds = truth.clock_s / 300
+    length = {("Duration" if truth.marks else "duration"): truth.clock_s} if truth.says_length else {}
+    names = ("hdTimeStart", "hdTimeEnd") if truth.marks else ("startTime", "endTime")
+    items = [{"event": word, names[0]: start * seconds, names[1]: stop * seconds} for word, start, stop in truth.events]
+    value = {"info": length, **({"markResult": {"marks": items}} if truth.marks else {"events": items})}
     path.write_text(json.dumps(value))
 
 
-def _write_hand(folder: Path, made: Recording, side: str) -> None:
+def _write_hand(folder: Path, truth: Recording, side: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    orient, fingers, wrist, betas = made.hands[side]
+    orient, fingers, wrist, betas = truth.hands[side]
     rest = HANDS[side].joint_regressor @ (HANDS[side].template_m + HANDS[side].shape_directions @ betas)
     for frame in range(len(orient)):
-        if frame in made.without.get(side, ()):
+        if frame in truth.without.get(side, ()):
             continue
-        camera = made.camera[frame]
-        turn = Rotation.from_matrix(camera[:3, :3]).inv() * Rotation.from_rotvec(orient[frame])
-        place = camera[:3, :3].T @ (wrist[frame] - camera[:3, 3]) - rest[0]
+        camera = truth.camera[frame]
+        rotation = Rotation.from_matrix(camera[:3, :3]).inv() * Rotation.from_rotvec(orient[frame])
+        position_m = camera[:3, :3].T @ (wrist[frame] - camera[:3, 3]) - rest[0]
         value = {
-            "poseCoeff": np.concatenate([turn.as_rotvec(), fingers]), "beta": betas, "trans": place,
+            "poseCoeff": np.concatenate([rotation.as_rotvec(), fingers]), "beta": betas, "trans": position_m,
             "kps2D": np.zeros((21, 2)),
         }  # fmt: skip
         (folder / f"{frame}.pickle").write_bytes(pickled(value))

@@ -1,6 +1,6 @@
-"""HOT3D recordings written as the samples of the makers' toolkit look, from a truth in a world with z up.
+"""Writes HOT3D recordings from a ground truth in a world with z up, like the samples of the authors' toolkit.
 
-Nothing of the adapter is used: rotations are SciPy's, UmeTrack's joints are built bone by bone, GLB is packed here.
+Independent of the adapter: rotations are SciPy's, UmeTrack's joints are computed bone by bone, GLB is packed here.
 """
 
 import io
@@ -42,15 +42,12 @@ def key_of(name: str) -> SequenceKey:
 
 @dataclass(frozen=True)
 class Truth:
-    """What is written. times_ns: per frame those of its cameras. turn, place: of the object, by frame, z up, metres.
+    """The ground truth of a recording, z up."""
 
-    hands: by side the numbers of a hand, its orientation and its wrist_xform's place by frame.
-    """
-
-    times_ns: tuple[tuple[int, ...], ...]
-    turn: Rotation
-    place: np.ndarray
-    hands: dict[str, tuple[dict, Rotation, np.ndarray]]
+    times_ns: tuple[tuple[int, ...], ...]  # per frame, the times of its cameras
+    rotation: Rotation  # of the object, per frame
+    position_m: np.ndarray  # (frame, 3) of the object
+    hands: dict[str, tuple[dict, Rotation, np.ndarray]]  # per side: numbers, orientation and wrist_xform's position
 
 
 def times(headset: str, count: int = N_FRAMES) -> tuple[tuple[int, ...], ...]:
@@ -61,27 +58,33 @@ def times(headset: str, count: int = N_FRAMES) -> tuple[tuple[int, ...], ...]:
 
 
 def truth(headset: str, kind: str, seed: int) -> Truth:
-    """Both hands hold a box, which is moved and turned."""
+    """Both hands grasp a box, which moves and rotates."""
     rng = np.random.default_rng(seed)
     time = np.linspace(0, 1, N_FRAMES)[:, None]
-    turn = Rotation.from_rotvec(rng.normal(0, 0.6, 3) + time * rng.normal(0, 0.9, 3))
-    place = np.array([0.2, -0.3, 0.9]) + time * rng.normal(0, 0.15, 3)
+    rotation = Rotation.from_rotvec(rng.normal(0, 0.6, 3) + time * rng.normal(0, 0.9, 3))
+    position_m = np.array([0.2, -0.3, 0.9]) + time * rng.normal(0, 0.15, 3)
     betas, hands = rng.normal(0, 0.5, 10), {}
     for side in SIDES:
         numbers = {"pose": rng.normal(0, 0.3, 15).tolist(), "betas": betas.tolist()}
         numbers = numbers if kind == "mano" else {"joint_angles": list(ANGLES), "hand_confidence": 1.0}
         tips, origin = mano_tips(side, numbers) if kind == "mano" else umetrack_tips(side)
-        reach = place + turn.apply(HALF_BOX_M * ((1, 0, 0) if side == "right" else (-1, 0, 0)) - tips)
-        hands[side] = numbers, turn, reach - origin
-    return Truth(times(headset), turn, place, hands)
+        reach = position_m + rotation.apply(HALF_BOX_M * ((1, 0, 0) if side == "right" else (-1, 0, 0)) - tips)
+        hands[side] = numbers, rotation, reach - origin
+    return Truth(times(headset), rotation, position_m, hands)
 
 
 def mano_tips(side: str, numbers: dict) -> tuple[np.ndarray, np.ndarray]:
-    """The middle of index, middle and ring tip from the wrist, of a hand that is not turned; and its rest wrist J0."""
+    """Mean of index, middle and ring tip relative to the wrist of an unrotated hand; and its rest wrist J0."""
     fingers = HANDS[side].mean_pose + np.array(numbers["pose"]) @ HANDS[side].components[:15]
     betas = np.array(numbers["betas"])
-    flat = HandTrack(np.zeros((1, 3)), np.zeros((1, 3)), fingers[None], betas[None], np.ones(1, dtype=bool))
-    return track_joints(flat, HANDS[side])[0, [16, 17, 19]].mean(axis=0), rest_points(HANDS[side], betas)[0]
+    at_origin = HandTrack(
+        wrist_m=np.zeros((1, 3)),
+        global_orient=np.zeros((1, 3)),
+        hand_pose=fingers[None],
+        betas=betas[None],
+        valid=np.ones(1, dtype=bool),
+    )
+    return track_joints(at_origin, HANDS[side])[0, [16, 17, 19]].mean(axis=0), rest_points(HANDS[side], betas)[0]
 
 
 def umetrack_tips(side: str) -> tuple[np.ndarray, np.ndarray]:
@@ -89,29 +92,29 @@ def umetrack_tips(side: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def umetrack_rest_m() -> np.ndarray:
-    """(21, 3) rest of the person's left hand in our order, from its wrist: that of the embedded hand."""
+    """(21, 3) rest joints of the left hand in hoidata's order, relative to the wrist."""
     rest = rest_points(HANDS.left)
     return rest - rest[0]
 
 
 def umetrack_joints(side: str, angles) -> np.ndarray:
-    """(21, 3) joints of a bent hand in our order from its wrist, bone by bone; NaN for the base of the thumb."""
-    rest, found = umetrack_rest_m(), np.zeros((21, 3))
+    """(21, 3) joints of a bent hand in hoidata's order, relative to the wrist; NaN for the base of the thumb."""
+    rest, result = umetrack_rest_m(), np.zeros((21, 3))
     for number, (first, second, third, tip) in enumerate(DIGITS):
         sideways, *bends = angles[4 * number : 4 * number + 4]
-        turn = Rotation.from_rotvec(np.array(SIDEWAYS) * sideways)
-        found[first] = rest[first]
+        rotation = Rotation.from_rotvec(np.array(SIDEWAYS) * sideways)
+        result[first] = rest[first]
         for bend, start, end in zip(bends, (first, second, third), (second, third, tip), strict=True):
-            turn = turn * Rotation.from_rotvec(np.array(BENDING) * bend)
-            found[end] = found[start] + turn.apply(rest[end] - rest[start])
-    found[13] = np.nan
-    return found * ((-1, 1, 1) if side == "right" else 1)
+            rotation = rotation * Rotation.from_rotvec(np.array(BENDING) * bend)
+            result[end] = result[start] + rotation.apply(rest[end] - rest[start])
+    result[13] = np.nan
+    return result * ((-1, 1, 1) if side == "right" else 1)
 
 
 def profile() -> dict:
-    """In millimetres, with whole numbers as floats, as the makers' files have it."""
+    """A profile in millimetres, with integers as floats as in the released files."""
     rest = (umetrack_rest_m() * 1000).tolist()
-    places = [rest[joint] for first, second, third, _ in DIGITS for joint in (first, first, second, third)]
+    positions_m = [rest[joint] for first, second, third, _ in DIGITS for joint in (first, first, second, third)]
     landmarks = [(digit[3], 4 + 3 * number) for number, digit in enumerate(DIGITS)]
     landmarks += [(0, 1), (14, 2), (15, 3)]
     for number, (first, second, third, _) in enumerate(DIGITS[1:], 1):
@@ -119,7 +122,7 @@ def profile() -> dict:
     return {
         "hand_model": {
             "hand_scale": 1.0,
-            "joint_rest_positions": [*places, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]],
+            "joint_rest_positions": [*positions_m, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]],
             "joint_rotation_axes": [*([SIDEWAYS, BENDING, BENDING, BENDING] * 5), [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
             "landmark_rest_bone_indices": [*([bone] * 3 for _, bone in landmarks), [1, 8, 5]],
             "landmark_rest_bone_weights": [*([1.0, 0.0, 0.0] for _ in landmarks), [0.75, 0.125, 0.125]],
@@ -129,20 +132,20 @@ def profile() -> dict:
     }
 
 
-def wxyz(turn: Rotation) -> list[float]:
-    return np.roll(turn.as_quat(), 1).tolist()
+def wxyz(rotation: Rotation) -> list[float]:
+    return np.roll(rotation.as_quat(), 1).tolist()
 
 
 def hand_lines(whole: Truth, headset: str) -> str:
-    """A line per time; the hands of all times of a frame are alike."""
+    """One line per time. All times of a frame have the same hands."""
     world, lines = HEADSET_FROM[headset], []
     for frame, frame_times in enumerate(whole.times_ns):
         poses = {}
-        for side, (numbers, turn, place) in whole.hands.items():
-            # MANO turns about its rest wrist, so that place + rest wrist is what another frame turns.
+        for side, (numbers, rotation, position_m) in whole.hands.items():
+            # MANO rotates about its rest wrist, so a change of frame rotates position + rest wrist.
             rest = rest_points(HANDS[side], numbers["betas"])[0] if "betas" in numbers else np.zeros(3)
-            moved = (world.apply(place[frame] + rest) - rest).tolist()
-            wrist = {"t_xyz": moved, "q_wxyz": wxyz(world * turn[frame])}
+            moved = (world.apply(position_m[frame] + rest) - rest).tolist()
+            wrist = {"t_xyz": moved, "q_wxyz": wxyz(world * rotation[frame])}
             poses[str(SIDES.index(side))] = {**numbers, "wrist_xform": wrist}
         lines += [json.dumps({"timestamp_ns": time, "hand_poses": poses}) for time in frame_times]
     return "".join(f"{line}\n" for line in lines)
@@ -151,28 +154,30 @@ def hand_lines(whole: Truth, headset: str) -> str:
 def object_rows(uid: str, whole: Truth, headset: str) -> list[tuple[int, str]]:
     world = HEADSET_FROM[headset]
     return [
-        (time, ",".join([uid, str(time), *map(repr, map(float, (*world.apply(place), *wxyz(world * turn))))]))
-        for frame_times, turn, place in zip(whole.times_ns, whole.turn, whole.place, strict=True)
+        (time, ",".join([uid, str(time), *map(repr, map(float, (*world.apply(position_m), *wxyz(world * rotation))))]))
+        for frame_times, rotation, position_m in zip(whole.times_ns, whole.rotation, whole.position_m, strict=True)
         for time in frame_times
     ]
 
 
 def object_table(rows: list[tuple[int, str]]) -> str:
-    return "\n".join([OBJECT_HEAD, *(text for _, text in sorted(rows, key=lambda row: row[0]))]) + "\n"
+    return (
+        "\n".join([OBJECT_HEAD, *(text for _, text in sorted(rows, key=lambda time_and_text: time_and_text[0]))]) + "\n"
+    )
 
 
 def mask_table(whole: Truth, headset: str, failed: dict[int, str]) -> str:
-    """failed: frame to the camera that does not see it well."""
-    rows = ["timestamp[ns],stream_id,mask"]
+    """failed: camera stream that failed, by frame."""
+    lines = ["timestamp[ns],stream_id,mask"]
     for frame, frame_times in enumerate(whole.times_ns):
         for number, stream in enumerate(STREAMS[headset]):
-            rows.append(f"{frame_times[min(number, len(frame_times) - 1)]},{stream},{failed.get(frame) != stream}")
-    return "\n".join(rows) + "\n"
+            lines.append(f"{frame_times[min(number, len(frame_times) - 1)]},{stream},{failed.get(frame) != stream}")
+    return "\n".join(lines) + "\n"
 
 
 def metadata(name: str, headset: str) -> str:
-    known = {"mano_hand_pose_gt": True, "umetrack_hand_pose_gt": True, "object_pose_gt": True}
-    facts = {"gt_available_status": known, "headset": headset, "participant_id": name[:5], "recording_name": name}
+    status = {"mano_hand_pose_gt": True, "umetrack_hand_pose_gt": True, "object_pose_gt": True}
+    facts = {"gt_available_status": status, "headset": headset, "participant_id": name[:5], "recording_name": name}
     return json.dumps(facts, indent=4) + "\n"
 
 
@@ -183,13 +188,20 @@ def instances() -> str:
 
 
 def glb(vertices, faces=FACES, node: dict | None = None) -> bytes:
-    """A binary glTF 2.0 file of one mesh; vertices in metres; node: where the scene puts it."""
+    """A binary glTF 2.0 file of one mesh. vertices: metres. node: transform in the scene."""
     body = np.asarray(vertices, "<f4").tobytes()
     corners = np.asarray(faces, "<u2").tobytes()
     views = [{"buffer": 0, "byteOffset": 0, "byteLength": len(body)}]
     views.append({"buffer": 0, "byteOffset": len(body), "byteLength": len(corners)})
     low, high = np.asarray(vertices, "<f4").min(axis=0).tolist(), np.asarray(vertices, "<f4").max(axis=0).tolist()
-    place = {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": len(vertices), "min": low, "max": high}
+    position_accessor = {
+        "bufferView": 0,
+        "componentType": 5126,
+        "type": "VEC3",
+        "count": len(vertices),
+        "min": low,
+        "max": high,
+    }
     corner = {"bufferView": 1, "componentType": 5123, "type": "SCALAR", "count": 3 * len(faces)}
     tree = {
         "asset": {"version": "2.0"},
@@ -197,7 +209,7 @@ def glb(vertices, faces=FACES, node: dict | None = None) -> bytes:
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, **(node or {})}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
-        "accessors": [place, corner],
+        "accessors": [position_accessor, corner],
         "bufferViews": views,
         "buffers": [{"byteLength": len(body) + len(corners)}],
     }
@@ -249,16 +261,24 @@ def write_clip(root: Path, headset: str, number: int, recording: str, whole: Tru
     for frame in range(N_FRAMES):
         hands: dict = {"left": None} if frame == 5 else {}
         for side in SIDES if frame != 5 else ("right",):
-            numbers, turn, place = whole.hands[side]
+            numbers, rotation, position_m = whole.hands[side]
             rest = rest_points(HANDS[side], betas)[0]
-            wrist = [*(world * turn[frame]).as_rotvec(), *(world.apply(place[frame] + rest) - rest)]
-            angles = {"joint_angles": list(ANGLES[:20]), "T_world_from_wrist": rigid(world * turn[frame], wrist[3:])}
+            wrist = [*(world * rotation[frame]).as_rotvec(), *(world.apply(position_m[frame] + rest) - rest)]
+            angles = {
+                "joint_angles": list(ANGLES[:20]),
+                "T_world_from_wrist": rigid(world * rotation[frame], wrist[3:]),
+            }
             hands[side] = {"mano_pose": {"thetas": numbers["pose"], "wrist_xform": wrist}, "umetrack_pose": angles}
             hands[side].pop(f"{without}_pose", None)
-        pose = rigid(world * whole.turn[frame], world.apply(whole.place[frame]))
-        thing = {"object_bop_id": "9", "object_uid": MUG, "object_name": "mug_white", "T_world_from_object": pose}
+        pose = rigid(world * whole.rotation[frame], world.apply(whole.position_m[frame]))
+        tracked_object = {
+            "object_bop_id": "9",
+            "object_uid": MUG,
+            "object_name": "mug_white",
+            "T_world_from_object": pose,
+        }
         members[f"{frame:06d}.hands.json"] = json.dumps(hands)
-        members[f"{frame:06d}.objects.json"] = json.dumps({"9": [thing]})
+        members[f"{frame:06d}.objects.json"] = json.dumps({"9": [tracked_object]})
         members[f"{frame:06d}.image_1201-1.jpg"] = "no image"
     with tarfile.open(path, "w") as archive:
         for name, text in members.items():
@@ -272,12 +292,12 @@ def write_clip(root: Path, headset: str, number: int, recording: str, whole: Tru
     return path
 
 
-def rigid(turn: Rotation, place) -> dict:
-    return {"translation_xyz": [float(number) for number in place], "quaternion_wxyz": wxyz(turn)}
+def rigid(rotation: Rotation, position_m) -> dict:
+    return {"translation_xyz": [float(number) for number in position_m], "quaternion_wxyz": wxyz(rotation)}
 
 
 def write_two(root: Path) -> Path:
-    """One of each headset, both with MANO's numbers; each has an object of its own."""
+    """One recording per headset, both with MANO parameters and with different objects."""
     write_assets(root)
     write_recording(root, ARIA, "Aria", "mano", 0, MUG)
     write_recording(root, QUEST, "Quest3", "mano", 1, MOUSE)

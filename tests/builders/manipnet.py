@@ -69,7 +69,7 @@ TIPS = {
     "PINKY_DIP_FE": [-0.24, -0.01, -0.01],
 }
 REFERENCE = {"capsules": [{"joint": joint, "end_local": end} for joint, end in TIPS.items()]}
-# Columns of a hand row: place, turn of the wrist, then (Y, X, Z) degrees of the sixteen other joints in file order.
+# Columns of a hand row: position and rotation of the wrist, then (Y, X, Z) degrees of the other 16 joints.
 POSE = [
     *(1.5, 2.0, -0.5, 40.0, -30.0, 20.0),
     *(10.0, -5.0, 8.0, 12.0, 20.0, -15.0, 5.0, 6.0, 7.0, -8.0, 9.0, -10.0),
@@ -89,14 +89,18 @@ def write_gz(path: Path, text: str) -> None:
 
 
 def motion_text(head: str, rows: list[list[float]]) -> str:
-    return head % len(rows) + "\n".join(" ".join(f"{value:.6f}" for value in row) + " " for row in rows) + "\n"
+    return (
+        head % len(rows)
+        + "\n".join(" ".join(f"{value:.6f}" for value in frame_numbers) + " " for frame_numbers in rows)
+        + "\n"
+    )
 
 
-def write_tree(root: Path, left: list, right: list, thing: list, name: str = "tetra_large7") -> RawTree:
+def write_tree(root: Path, left: list, right: list, object_rows: list, name: str = "tetra_large7") -> RawTree:
     folder = root / "sequences" / name
     write_gz(folder / "leftHand.bvh.gz", motion_text(HAND.replace("~", ""), left))
     write_gz(folder / "rightHand.bvh.gz", motion_text(HAND.replace("~", "-"), right))
-    write_gz(folder / "tetra_large.bvh.gz", motion_text(THING, thing))
+    write_gz(folder / "tetra_large.bvh.gz", motion_text(THING, object_rows))
     write_gz(root / "objects" / "Primitive" / "tetra_large.obj.gz", TETRA)
     (root / "hand").mkdir(exist_ok=True)
     (root / "hand" / "hand_reference.json").write_text(json.dumps(REFERENCE))
@@ -105,30 +109,30 @@ def write_tree(root: Path, left: list, right: list, thing: list, name: str = "te
 
 def lift_rows(n_frames: int = 600) -> tuple[list, list, list]:
     """A flat right hand whose palm carries the object 30 cm up after half a second; the left hand waits nearby."""
-    left, right, thing = [], [], []
+    left, right, object_rows = [], [], []
     for frame in range(n_frames):
         sway = 0.002 * np.sin(frame / 9)
         height = 1.0 + 3.0 * np.clip((frame - 60) / 240, 0, 1)
         right.append([sway, height, 0.0, *[0.0] * 3, *FLAT])
         left.append([-6.0 + sway, 1.5, 0.0, *[0.0] * 3, *FLAT])
-        thing.append([-0.9 + sway, height, -0.4, 0.0, 0.0, 0.0])
-    return left, right, thing
+        object_rows.append([-0.9 + sway, height, -0.4, 0.0, 0.0, 0.0])
+    return left, right, object_rows
 
 
 def write_two(root: Path) -> Path:
     """A lift, and the same with a cube."""
     write_tree(root, *lift_rows())
     shutil.copytree(root / "sequences/tetra_large7", root / "sequences/cube_large8")
-    thing = root / "sequences/cube_large8/tetra_large.bvh.gz"
-    text = gzip.decompress(thing.read_bytes()).replace(b"tetra_large", b"cube_large")
-    thing.with_name("cube_large.bvh.gz").write_bytes(gzip.compress(text, mtime=0))
-    thing.unlink()
+    object_file = root / "sequences/cube_large8/tetra_large.bvh.gz"
+    text = gzip.decompress(object_file.read_bytes()).replace(b"tetra_large", b"cube_large")
+    object_file.with_name("cube_large.bvh.gz").write_bytes(gzip.compress(text, mtime=0))
+    object_file.unlink()
     shutil.copy(root / "objects/Primitive/tetra_large.obj.gz", root / "objects/Primitive/cube_large.obj.gz")
     return root
 
 
 def write_skin(root: Path, seed: int = 0) -> dict[str, np.ndarray]:
-    """A skin of random points on random bones, and a reference with all capsules; the skin's arrays. Right hand."""
+    """Write a right hand: random skin points on random bones, and all capsules. Returns the skin."""
     random = np.random.default_rng(seed)
     poses = np.tile(np.eye(4), (17, 1, 1))
     poses[1:, :3, :3] = Rotation.from_rotvec(random.normal(0, 0.3, (16, 3))).as_matrix()
@@ -163,12 +167,12 @@ def write_skin(root: Path, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def recording_control(recording: HandRecording) -> Control:
-    """What a recording with its source's own hands gives the network, at its own rate, time 0 in its first frame."""
-    thing, time_s = recording.object, recording.time_s
+    """Inputs of the network from a recording with 17-joint hands, at its rate, with time 0 in its first frame."""
+    object_track, time_s = recording.object, recording.time_s
     wrists: dict[Side, Motion] = {}
     for side in SIDES:
         pose = recording.world_from_wrist(side)
         wrists[side] = Motion(time_s, pose.rotation, pose.translation)
-    body = thing.world_from_object
-    hinge = None if thing.hinge_rad is None else thing.hinge_rad.astype(np.float64)
-    return Control(wrists, Motion(time_s, body.rotation, body.translation), thing.model, hinge)
+    body = object_track.world_from_object
+    hinge = None if object_track.hinge_rad is None else object_track.hinge_rad.astype(np.float64)
+    return Control(wrists, Motion(time_s, body.rotation, body.translation), object_track.model, hinge)

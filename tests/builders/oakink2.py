@@ -1,5 +1,5 @@
-"""OakInk2 recordings written as the toolkit reads them, from a truth in the world: pickles of tensors and of arrays as
-NumPy 1 names them, programs by pairs of ranges. Nothing of the adapter is used: rotations are SciPy's."""
+"""Writes OakInk2 recordings from a ground truth in the world: pickles of tensors and of arrays with NumPy 1's names,
+programs by pairs of ranges. Independent of the adapter: rotations are SciPy's."""
 
 import contextlib
 import json
@@ -58,20 +58,26 @@ def key_of(name: str) -> SequenceKey:
 
 
 def holding(side: Side, pose: np.ndarray, half, random) -> tuple:
-    """The middle of index, middle and ring tip lies on one side of the object."""
-    turn, betas = Rotation.from_matrix(pose[:, :3, :3]), random.normal(0, 0.3, 10)
+    """A hand whose mean of index, middle and ring tip is on one side of the object."""
+    rotation, betas = Rotation.from_matrix(pose[:, :3, :3]), random.normal(0, 0.3, 10)
     fingers = HANDS[side].mean_pose + random.normal(0, 0.05, 45)
-    flat = HandTrack(np.zeros((1, 3)), np.zeros((1, 3)), fingers[None], betas[None], np.ones(1, dtype=bool))
-    tips = track_joints(flat, HANDS[side])[0, [16, 17, 19]].mean(axis=0)
-    place = np.array(half) * ((1, 0, 0) if side == "right" else (-1, 0, 0))
-    return turn.as_rotvec(), fingers, pose[:, :3, 3] + turn.apply(place - tips), betas
+    at_origin = HandTrack(
+        wrist_m=np.zeros((1, 3)),
+        global_orient=np.zeros((1, 3)),
+        hand_pose=fingers[None],
+        betas=betas[None],
+        valid=np.ones(1, dtype=bool),
+    )
+    tips = track_joints(at_origin, HANDS[side])[0, [16, 17, 19]].mean(axis=0)
+    position_m = np.array(half) * ((1, 0, 0) if side == "right" else (-1, 0, 0))
+    return rotation.as_rotvec(), fingers, pose[:, :3, 3] + rotation.apply(position_m - tips), betas
 
 
 def recording(name: str, seed: int, n_frames: int = N_FRAMES, **changes) -> Recording:
-    """A laptop that is opened beside a mug, a bottle whose cap is taken off, or the mug alone."""
+    """A laptop that is opened next to a mug, a bottle whose cap is removed, or the mug alone."""
     random, time = np.random.default_rng(seed), np.linspace(0, 1, n_frames)[:, None]
-    turn = Rotation.from_rotvec(random.normal(0, 0.5, 3) + time * random.normal(0, 0.6, 3))
-    pose = transforms(turn, np.array([0.2, 0.9, 0.1]) + time * random.normal(0, 0.2, 3))
+    rotation = Rotation.from_rotvec(random.normal(0, 0.5, 3) + time * random.normal(0, 0.6, 3))
+    pose = transforms(rotation, np.array([0.2, 0.9, 0.1]) + time * random.normal(0, 0.2, 3))
     stop, grips = FIRST + n_frames, {side: pose for side in SIDES}
     if name == LAPTOP:
         swing = Rotation.from_rotvec(np.outer(0.2 + 1.5 * time[:, 0] ** 2, AXIS))
@@ -107,7 +113,7 @@ def _mug() -> trimesh.Trimesh:
 
 @contextlib.contextmanager
 def numpy_1() -> Iterator[None]:
-    """Arrays are pickled under the name they had before NumPy 2, as those of the release are."""
+    """Pickle arrays with the module name before NumPy 2, as in the release."""
     rebuild = np._core.multiarray._reconstruct  # type: ignore[attr-defined]
     before = rebuild.__module__
     rebuild.__module__ = "numpy.core.multiarray"
@@ -124,7 +130,7 @@ def dump(path: Path, value: object) -> None:
 
 
 def tensor(values) -> torch.Tensor:
-    """(1, ...) float32, with a storage of its own."""
+    """(1, ...) float32 with separate storage."""
     return torch.tensor(np.asarray(values)[None], dtype=torch.float32)
 
 
@@ -133,36 +139,36 @@ def quaternions(orient, fingers) -> np.ndarray:
     return Rotation.from_rotvec(np.concatenate([orient, fingers]).reshape(16, 3)).as_quat()[:, [3, 0, 1, 2]]
 
 
-def annotation(made: Recording) -> dict:
-    frames = made.frames
+def annotation(truth: Recording) -> dict:
+    frames = truth.frames
     camera = {"allocentric_top": {frame: np.eye(4) for frame in frames[::4]}}
-    # Of the body's ten tensors two: what an adapter passes over need not be whole.
+    # Two of the body's ten tensors, because adapters ignore the body.
     body = {"world_tsl": tensor(np.zeros(3)), "body_shape": tensor(np.zeros(300))}
     mano = {frame: {} for frame in frames}
-    for side, (orient, fingers, wrist, betas) in made.hands.items():
+    for side, (orient, fingers, wrist, betas) in truth.hands.items():
         for at, frame in enumerate(frames):
             values = {"pose_coeffs": quaternions(orient[at], fingers), "tsl": wrist[at], "betas": betas}
             mano[frame] |= {f"{PREFIX[side]}{name}": tensor(value) for name, value in values.items()}
     return {
         "cam_def": {"104422070969": "allocentric_top"}, "cam_selection": ["allocentric_top"],
         "frame_id_list": frames[::4], "cam_intr": {"allocentric_top": {frame: np.eye(3) for frame in frames[::4]}},
-        "cam_extr": camera, "mocap_frame_id_list": frames, "obj_list": list(made.parts),
+        "cam_extr": camera, "mocap_frame_id_list": frames, "obj_list": list(truth.parts),
         "obj_transf": {
-            name: {f: pose for f, pose in zip(frames, poses, strict=True) if f not in made.untracked.get(name, ())}
-            for name, (_, poses) in made.parts.items()
+            name: {f: pose for f, pose in zip(frames, poses, strict=True) if f not in truth.untracked.get(name, ())}
+            for name, (_, poses) in truth.parts.items()
         },
         "raw_smplx": dict.fromkeys(frames, body), "raw_mano": mano,
     }  # fmt: skip
 
 
-def program(made: Recording) -> dict:
+def program(truth: Recording) -> dict:
     return {
         str((left, right)): {
             "primitive": primitive, "obj_list": [*(on_left or []), *(on_right or [])], "interaction_mode": mode,
             "primitive_lh": left and primitive, "primitive_rh": right and primitive, "obj_list_lh": on_left,
             "obj_list_rh": on_right,
         }
-        for left, right, primitive, mode, on_left, on_right in made.program
+        for left, right, primitive, mode, on_left, on_right in truth.program
     }  # fmt: skip
 
 
@@ -171,10 +177,10 @@ def write_json(path: Path, value: object) -> None:
     path.write_text(json.dumps(value, indent=4))
 
 
-def write_recording(root: Path, made: Recording) -> Path:
-    dump(root / f"anno_preview/{made.token}.pkl", annotation(made))
-    write_json(root / f"program/program_info/{made.token}.json", program(made))
-    for name, (mesh, _) in made.parts.items():
+def write_recording(root: Path, truth: Recording) -> Path:
+    dump(root / f"anno_preview/{truth.token}.pkl", annotation(truth))
+    write_json(root / f"program/program_info/{truth.token}.json", program(truth))
+    for name, (mesh, _) in truth.parts.items():
         write_obj(root / f"object_repair/align_ds/{name}/model.obj", mesh.vertices, mesh)
     write_json(root / "object_repair/obj_desc.json", {k: {"obj_id": k, "obj_name": v} for k, v in NAMES.items()})
     write_json(root / "object_affordance/object_part_tree.json", TREE)

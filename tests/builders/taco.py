@@ -36,32 +36,38 @@ def write_box(path: Path, half_m: np.ndarray) -> None:
 
 
 def write_recording(root: Path, name: str, seed: int) -> None:
-    """Both hands hold the tool, which is moved and turned above a bowl that stands still; its ids are 012 and 105."""
+    """Both hands grasp the tool, which moves and rotates above a resting bowl. Object ids are 012 and 105."""
     rng = np.random.default_rng(seed)
     time = np.linspace(0, 1, N_FRAMES)[:, None]
-    turn = Rotation.from_rotvec(rng.normal(0, 0.6, 3) + time * rng.normal(0, 1.2, 3))
-    place = np.array([0.3, -0.2, 1.0]) + time * rng.normal(0, 0.2, 3)
+    rotation = Rotation.from_rotvec(rng.normal(0, 0.6, 3) + time * rng.normal(0, 1.2, 3))
+    position_m = np.array([0.3, -0.2, 1.0]) + time * rng.normal(0, 0.2, 3)
     tool, target = np.tile(np.eye(4), (2, N_FRAMES, 1, 1))
-    tool[:, :3, :3], tool[:, :3, 3], target[:, :3, 3] = turn.as_matrix(), place, (0.3, -0.2, 0.8)
+    tool[:, :3, :3], tool[:, :3, 3], target[:, :3, 3] = rotation.as_matrix(), position_m, (0.3, -0.2, 0.8)
     folder = root / "Object_Poses" / name
     folder.mkdir(parents=True)
     np.save(folder / "tool_012.npy", tool.astype(np.float32))
     np.save(folder / "target_105.npy", target.astype(np.float32))
     for side in SIDES:
-        poses, betas = hand(side, turn, place, rng)
+        poses, betas = hand(side, rotation, position_m, rng)
         dump(root / "Hand_Poses" / name / f"{side}_hand.pkl", poses)
         dump(root / "Hand_Poses" / name / f"{side}_hand_shape.pkl", {"hand_shape": torch.tensor(betas).float()})
 
 
-def hand(side: str, turn: Rotation, place: np.ndarray, rng: np.random.Generator) -> tuple[dict, np.ndarray]:
-    """The middle of index, middle and ring tip lies on one side of the tool; frame keys count from 00001."""
+def hand(side: str, rotation: Rotation, position_m: np.ndarray, rng: np.random.Generator) -> tuple[dict, np.ndarray]:
+    """A hand whose mean of index, middle and ring tip is on one side of the tool. Frame keys count from 00001."""
     betas, fingers = rng.normal(0, 0.3, 10), HANDS[side].mean_pose + rng.normal(0, 0.05, 45)
-    flat = HandTrack(np.zeros((1, 3)), np.zeros((1, 3)), fingers[None], betas[None], np.ones(1, dtype=bool))
-    tips = track_joints(flat, HANDS[side])[0, [16, 17, 19]].mean(axis=0)
-    wrist = place + turn.apply(HALF_TOOL_M * ((1, 0, 0) if side == "right" else (-1, 0, 0)) - tips)
+    at_origin = HandTrack(
+        wrist_m=np.zeros((1, 3)),
+        global_orient=np.zeros((1, 3)),
+        hand_pose=fingers[None],
+        betas=betas[None],
+        valid=np.ones(1, dtype=bool),
+    )
+    tips = track_joints(at_origin, HANDS[side])[0, [16, 17, 19]].mean(axis=0)
+    wrist = position_m + rotation.apply(HALF_TOOL_M * ((1, 0, 0) if side == "right" else (-1, 0, 0)) - tips)
     poses = {
         f"{frame + 1:05d}": {
-            "hand_pose": torch.tensor(np.concatenate((turn.as_rotvec()[frame], fingers))).float(),
+            "hand_pose": torch.tensor(np.concatenate((rotation.as_rotvec()[frame], fingers))).float(),
             "hand_trans": torch.tensor(wrist[frame]).float(),
         }
         for frame in range(N_FRAMES)
@@ -78,7 +84,7 @@ def write_taco(root: Path) -> Path:
 
 
 def write_two(root: Path) -> Path:
-    """Two recordings that share the target; each tool has a mesh of its own."""
+    """Two recordings with the same target and different tools."""
     for seed, name in enumerate(NAMES[:2]):
         write_recording(root, name, seed)
     other = root / "Object_Poses" / NAMES[1]

@@ -96,7 +96,7 @@ def test_a_killed_cluster_worker_changes_no_byte(corpus, hands, on_cluster, tmp_
 def test_a_sequence_that_ends_each_worker_is_quarantined_and_the_others_are_not(corpus, hands, on_cluster, tmp_path):
     summary = convert_dataset(DyingAlways(), corpus / "raw", hands, tmp_path / "clips", progress=False)
     assert summary.clips == 8
-    (quarantined,) = summary.left_out
+    (quarantined,) = summary.quarantined
     assert quarantined.source_key == f"grab/{DIES}"
     assert "several workers" in quarantined.got
 

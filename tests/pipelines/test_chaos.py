@@ -376,7 +376,7 @@ from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets.grab.adapter import GrabAdapter
 from hoidata.hands import load_embedded_hands
 done = convert_dataset(GrabAdapter(), {str(raw)!r}, load_embedded_hands(), {str(tmp_path / "out")!r}, progress=False)
-print(done.clips, len(done.left_out), done.left_out[0].remedy)
+print(done.clips, len(done.quarantined), done.quarantined[0].remedy)
 """
     done = typed(sys.executable, "-c", code)
     clips = len(list(raw.glob("grab/*/*.npz"))) - 1

@@ -172,8 +172,8 @@ def test_verifying_a_dataset_that_is_absent_fails_with_what_is_missing_and_where
     for words in (f"{name}: not present", adapter.licence, adapter.where_to_register, f"raw scan {name} --root"):
         assert words in result.stdout
     for part in adapter.parts:
-        assert f"missing: {part.what}" in result.stdout
-        assert part.where in result.stdout
+        assert f"missing: {part.contents}" in result.stdout
+        assert part.archive in result.stdout
     assert result.exit_code == 1
 
 

@@ -1,4 +1,4 @@
-"""ARCTIC (Fan et al. 2023): two hands and a hinged object; segments and words from Text2HOI's description files."""
+"""ARCTIC (Fan et al. 2023): two hands and a hinged object; segments and verbs from Text2HOI's description files."""
 
 import re
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import numpy as np
 
 from hoidata.clips.clip import SIDES, BodyTrack, CameraTrack, Clip, HandTrack, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, SourceHand, to_track
-from hoidata.dataset_folders import facts_beside
+from hoidata.dataset_folders import facts_of_adapter
 from hoidata.datasets import checks
 from hoidata.datasets.arctic.files import (
     EXCLUDED,
@@ -21,7 +21,7 @@ from hoidata.datasets.arctic.files import (
     parse_misc,
     parse_parts,
 )
-from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.base import AdapterBase, DatasetPart, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.known_meshes import raw_mesh
 from hoidata.errors import BadInput
 from hoidata.files import load_npy_object
@@ -31,8 +31,8 @@ from hoidata.objects.mesh import Mesh
 from hoidata.objects.model import Hinge, ObjectModel
 
 MILLIMETRES = 1e-3
-TOPS = ("", "data/", "arctic_data/data/")
-PARTS_ALIGNED_MM = 5.0  # top.obj and bottom.obj have a topology of their own
+TOP_FOLDERS = ("", "data/", "arctic_data/data/")
+PARTS_ALIGNED_MM = 5.0  # tolerance: top.obj and bottom.obj have another topology than mesh.obj
 HINGE_AXIS = (0.0, 0.0, -1.0)
 FRAME = WorldFrame("+z", "stated", "ARCTIC's motion-capture world, right-handed, z up, metres")
 CONVENTION = HandConvention(
@@ -44,28 +44,28 @@ CONVENTION = HandConvention(
 )
 
 
-def _below_tops(*patterns: str) -> tuple[str, ...]:
-    return tuple(f"{top}{pattern}" for top in TOPS for pattern in patterns)
+def _below_top_folders(*patterns: str) -> tuple[str, ...]:
+    return tuple(f"{top}{pattern}" for top in TOP_FOLDERS for pattern in patterns)
 
 
 MOTION_PARTS = (
-    DatasetPart("object motion", _below_tops("raw_seqs/s*/*.object.npy"), "raw_seqs.zip"),
-    DatasetPart("hand motion", _below_tops("raw_seqs/s*/*.mano.npy"), "raw_seqs.zip"),
-    DatasetPart("object meshes", _below_tops("meta/object_vtemplates/*/mesh.obj"), "meta.zip"),
-    DatasetPart("parts of the objects", _below_tops("meta/object_vtemplates/*/parts.json"), "meta.zip"),
+    DatasetPart("object motion", _below_top_folders("raw_seqs/s*/*.object.npy"), "raw_seqs.zip"),
+    DatasetPart("hand motion", _below_top_folders("raw_seqs/s*/*.mano.npy"), "raw_seqs.zip"),
+    DatasetPart("object meshes", _below_top_folders("meta/object_vtemplates/*/mesh.obj"), "meta.zip"),
+    DatasetPart("parts of the objects", _below_top_folders("meta/object_vtemplates/*/parts.json"), "meta.zip"),
     DatasetPart(
         "separate meshes of the parts",
-        _below_tops("meta/object_vtemplates/*/bottom.obj", "meta/object_vtemplates/*/top.obj"),
+        _below_top_folders("meta/object_vtemplates/*/bottom.obj", "meta/object_vtemplates/*/top.obj"),
         "meta.zip",
         optional=True,
     ),
-    DatasetPart("head camera", _below_tops("raw_seqs/s*/*.egocam.dist.npy"), "raw_seqs.zip", optional=True),
-    DatasetPart("bodies", _below_tops("raw_seqs/s*/*.smplx.npy"), "raw_seqs.zip", optional=True),
-    DatasetPart("image offsets", _below_tops("meta/misc.json"), "meta.zip", optional=True),
+    DatasetPart("head camera", _below_top_folders("raw_seqs/s*/*.egocam.dist.npy"), "raw_seqs.zip", optional=True),
+    DatasetPart("bodies", _below_top_folders("raw_seqs/s*/*.smplx.npy"), "raw_seqs.zip", optional=True),
+    DatasetPart("image offsets", _below_top_folders("meta/misc.json"), "meta.zip", optional=True),
 )
 WITHHELD_SUBJECT = "s03"
 KINDS = ("mano.npy", "object.npy", "egocam.dist.npy", "smplx.npy")
-Stretches = Literal["described", "whole", "described-else-whole"]
+ClipSource = Literal["described", "whole", "described-else-whole"]
 
 
 @dataclass(frozen=True)
@@ -83,39 +83,42 @@ class _Motion:
 
 
 @dataclass(frozen=True)
-class ArcticAdapter(Described):
+class ArcticAdapter(AdapterBase):
     """Raw root: the folder with ``raw_seqs/``, ``meta/`` and ``description/`` (or ``data/`` above them).
 
-    clips: "described" gives one clip per line of Text2HOI's description files; "whole" one clip per sequence without
-    a verb, descriptions or not; "described-else-whole" the latter only where a sequence has no description.
-    margin_frames: frames kept before and after each described range. shortest_frames: shorter ranges are no clips.
-    all_pairs: keep the three pairs of verb and object that Text2HOI leaves out.
-    trimmed_frames: left out at both ends of a whole sequence (ARCTIC's own baselines leave out 10, whose images are
-    black). body: keep the parameters of the subject's SMPL-X body.
+    ``clips`` selects the clips: "described" gives one clip per line of Text2HOI's description files, "whole" one clip
+    without a verb per sequence, and "described-else-whole" the latter only for sequences without a description.
     """
 
-    facts = facts_beside(__file__)
-    margin_frames: int = 0
-    shortest_frames: int = 20
-    clips: Stretches = "described"
-    trimmed_frames: int = 0
-    all_pairs: bool = False
-    body: bool = False
+    facts = facts_of_adapter(__file__)
+    margin_frames: int = 0  # frames kept before and after each described range
+    shortest_frames: int = 20  # shorter ranges give no clip
+    clips: ClipSource = "described"
+    trimmed_frames: int = 0  # excluded at both ends of a whole sequence; ARCTIC's baselines exclude 10 (black images)
+    all_pairs: bool = False  # include the three pairs of verb and object that Text2HOI excludes
+    body: bool = False  # include the parameters of the subject's SMPL-X body
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
 
     @property
     def parts(self) -> tuple[DatasetPart, ...]:
-        """Descriptions are needed only where clips are cut by them."""
-        files = _below_tops("description/s*/*/description.txt")
-        where = "Text2HOI's description files (linked from its and ARCTIC's page)"
+        """Files of a complete raw folder. Descriptions are required for the setting ``clips: described`` only."""
+        files = _below_top_folders("description/s*/*/description.txt")
+        archive = "Text2HOI's description files (linked from its and ARCTIC's page)"
         optional = self.clips != "described"
-        return (*MOTION_PARTS, DatasetPart("segments and words", files, where, optional, "clips=whole"))
+        descriptions = DatasetPart(
+            contents="segments and words",
+            patterns=files,
+            archive=archive,
+            optional=optional,
+            unneeded_with="clips=whole",
+        )
+        return (*MOTION_PARTS, descriptions)
 
     def sequences(self, root: Path) -> list[SequenceKey]:
-        """One key per sequence that has any of its files; they are paired by name, never by position."""
+        """One key per sequence with at least one of its files. Files are paired by name."""
         names = set()
-        for top in TOPS:
+        for top in TOP_FOLDERS:
             for path in (Path(root) / top / "raw_seqs").glob("s*/*.npy"):
                 stem, _, kind = path.name.partition(".")
                 if kind in KINDS:
@@ -123,15 +126,15 @@ class ArcticAdapter(Described):
         return [SequenceKey(self.name, subject, f"{subject}/{stem}") for subject, stem in sorted(names)]
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
-        """One clip per described range of at least 20 frames; or the whole sequence as one."""
-        where = _found(raw, f"description/{key.name}/description.txt")
-        if self.clips == "whole" or (self.clips == "described-else-whole" and not raw.has(where)):
+        """One clip per described range of at least 20 frames, or one clip of the whole sequence."""
+        path = _path_in_copy(raw, f"description/{key.name}/description.txt")
+        if self.clips == "whole" or (self.clips == "described-else-whole" and not raw.has(path)):
             return [self._whole(raw, key, _read_motion(raw, key, hands, self.body))]
-        descriptions, results = _read_descriptions(raw, where, key)
+        descriptions, results = _read_descriptions(raw, path, key)
         motion = _read_motion(raw, key, hands, self.body)
-        noun = motion.object.model.name
+        object_name = motion.object.model.name
         for description, clip_id in zip(descriptions, _clip_ids(key, descriptions), strict=True):
-            problem = self._why_no_clip(where, description, noun, motion.n_frames)
+            problem = self._unusable_reason(path, description, object_name, motion.n_frames)
             if problem is None:
                 start, stop = description.start - 1 - self.margin_frames, description.stop + self.margin_frames
                 results.append(self._cut(raw, key, clip_id, motion, description, start, stop))
@@ -139,18 +142,18 @@ class ArcticAdapter(Described):
                 results.append(Quarantined.from_error(clip_id, problem))
         return results
 
-    def _why_no_clip(self, where: str, description: Description, noun: str, n_frames: int) -> BadInput | None:
-        """What keeps a described range from being a clip, or None."""
-        length, given = description.stop - description.start + 1, f"{description.start}-{description.stop}"
+    def _unusable_reason(self, path: str, description: Description, object_name: str, n_frames: int) -> BadInput | None:
+        """Why a described range gives no clip, or None."""
+        length, range_in_words = description.stop - description.start + 1, f"{description.start}-{description.stop}"
         if description.stop > n_frames:
-            return BadInput(where, f"frames 1 to {n_frames}", given)
+            return BadInput(path, f"frames 1 to {n_frames}", range_in_words)
         if length < self.shortest_frames:
             remedy = "nothing to do, or lower the setting shortest_frames"
-            return BadInput(f"{where}: {given}", f"{self.shortest_frames} frames or more", f"{length}", remedy)
-        if not self.all_pairs and (description.verb, noun) in EXCLUDED:
+            return BadInput(f"{path}: {range_in_words}", f"{self.shortest_frames} frames or more", f"{length}", remedy)
+        if not self.all_pairs and (description.verb, object_name) in EXCLUDED:
             remedy = "nothing to do, or set all_pairs"
-            got = f"{description.verb} {noun}"
-            return BadInput(f"{where}: {given}", "none of the pairs Text2HOI leaves out", got, remedy)
+            got = f"{description.verb} {object_name}"
+            return BadInput(f"{path}: {range_in_words}", "none of the pairs Text2HOI leaves out", got, remedy)
         return None
 
     def _whole(self, raw: RawTree, key: SequenceKey, motion: _Motion) -> Clip:
@@ -190,29 +193,27 @@ class ArcticAdapter(Described):
         return whole.take(slice(max(0, start), stop))
 
 
-def _found(raw: RawTree, path: str) -> str:
-    """The path below whichever top folder holds it; where it should be when none does."""
-    names = [f"{top}{path}" for top in TOPS]
-    usual = [name for name, top in zip(names, TOPS, strict=True) if (raw.root / top / "raw_seqs").is_dir()]
+def _path_in_copy(raw: RawTree, path: str) -> str:
+    """The path below the top folder that contains it; the expected path if none does."""
+    names = [f"{top}{path}" for top in TOP_FOLDERS]
+    usual = [name for name, top in zip(names, TOP_FOLDERS, strict=True) if (raw.root / top / "raw_seqs").is_dir()]
     return next((name for name in names if raw.has(name)), (usual or names)[0])
 
 
-def _read_descriptions(
-    raw: RawTree, where: str, key: SequenceKey
-) -> tuple[list[Description], list[Clip | Quarantined]]:
+def _read_descriptions(raw: RawTree, path: str, key: SequenceKey) -> tuple[list[Description], list[Clip | Quarantined]]:
     _refuse_withheld(raw, key)
-    if not raw.has(where):
+    if not raw.has(path):
         remedy = (
             "add Text2HOI's description files; where none was published (espressomachine), nothing to do, or set "
             "clips: described-else-whole"
         )
-        raise BadInput(where, "a description of the sequence's segments", "no file", remedy)
-    described, problems = parse_descriptions(raw.read(where), where)
+        raise BadInput(path, "a description of the sequence's segments", "no file", remedy)
+    described, problems = parse_descriptions(raw.read(path), path)
     return described, [Quarantined.from_error(f"{key}/line-{number:03d}", problem) for number, problem in problems]
 
 
 def _clip_ids(key: SequenceKey, descriptions: list[Description]) -> list[str]:
-    """Ids from the range as written; the hand is added where one range is described for two hands."""
+    """Ids from the described ranges, with the hand if one range is described for both hands separately."""
     names = [f"{key}/{item.start:04d}-{item.stop:04d}" for item in descriptions]
     with_hand = [f"{name}-{item.hand}" for name, item in zip(names, descriptions, strict=True)]
     ids = [full if names.count(name) > 1 else name for name, full in zip(names, with_hand, strict=True)]
@@ -223,8 +224,8 @@ def _clip_ids(key: SequenceKey, descriptions: list[Description]) -> list[str]:
 
 
 def _refuse_withheld(raw: RawTree, key: SequenceKey) -> None:
-    """Say so when the files that are missing were never published."""
-    paths = [_found(raw, f"raw_seqs/{key.name}.{kind}") for kind in ("mano.npy", "object.npy")]
+    """Raise BadInput with the reason if the missing files are unpublished."""
+    paths = [_path_in_copy(raw, f"raw_seqs/{key.name}.{kind}") for kind in ("mano.npy", "object.npy")]
     missing = [path for path in paths if not raw.has(path)]
     if key.subject == WITHHELD_SUBJECT and missing:
         got = f"none: ARCTIC withholds the motion of its test subject {WITHHELD_SUBJECT}"
@@ -233,7 +234,7 @@ def _refuse_withheld(raw: RawTree, key: SequenceKey) -> None:
 
 def _read_motion(raw: RawTree, key: SequenceKey, hands: HandPair, with_body: bool) -> _Motion:
     _refuse_withheld(raw, key)
-    paths = {kind: _found(raw, f"raw_seqs/{key.name}.{kind}") for kind in KINDS}
+    paths = {kind: _path_in_copy(raw, f"raw_seqs/{key.name}.{kind}") for kind in KINDS}
     pose_path, hand_path = paths["object.npy"], paths["mano.npy"]
     pose = checks.table(pose_path, load_npy_object(raw.file(pose_path)), 7)
     params = load_npy_object(raw.file(hand_path))
@@ -243,9 +244,9 @@ def _read_motion(raw: RawTree, key: SequenceKey, hands: HandPair, with_body: boo
         if tracks[side].n_frames != len(pose):
             got = f"{tracks[side].n_frames}"
             raise BadInput(f"{hand_path}: {side}", f"{len(pose)} frames as in {pose_path}", got)
-    name = re.sub(r"\d+$", "", key.name.partition("/")[2].split("_")[0])
+    object_name = re.sub(r"\d+$", "", key.name.partition("/")[2].split("_")[0])
     track = ObjectTrack(
-        _object_model(raw, name),
+        _object_model(raw, object_name),
         rotvec=canonical_rotvec(pose[:, 1:4]).astype(np.float32),
         translation_m=(pose[:, 4:7] * MILLIMETRES).astype(np.float32),
         hinge_rad=pose[:, 0].astype(np.float32),
@@ -259,40 +260,41 @@ def _read_motion(raw: RawTree, key: SequenceKey, hands: HandPair, with_body: boo
 def _camera(raw: RawTree, path: str, subject: str, n_frames: int) -> CameraTrack | None:
     if not raw.has(path):
         return None
-    misc = _found(raw, "meta/misc.json")
+    misc = _path_in_copy(raw, "meta/misc.json")
     offset = parse_misc(raw.read(misc), misc).get(subject, 0) if raw.has(misc) else 0
     return head_camera(path, load_npy_object(raw.file(path)), n_frames, offset)
 
 
-def _hand(where: str, block: Any, side: Side, hands: HandPair) -> HandTrack:
-    pose = checks.table(f"{where}.pose", checks.entry(where, block, "pose"), 45)
-    rotation = checks.table(f"{where}.rot", checks.entry(where, block, "rot"), 3, len(pose))
-    transl = checks.table(f"{where}.trans", checks.entry(where, block, "trans"), 3, len(pose))
-    shape = np.asarray(checks.entry(where, block, "shape"))
-    betas = checks.table(f"{where}.shape", shape[None] if shape.ndim == 1 else shape, 10)
+def _hand(location: str, params: Any, side: Side, hands: HandPair) -> HandTrack:
+    pose = checks.table(f"{location}.pose", checks.entry(location, params, "pose"), 45)
+    rotation = checks.table(f"{location}.rot", checks.entry(location, params, "rot"), 3, len(pose))
+    transl = checks.table(f"{location}.trans", checks.entry(location, params, "trans"), 3, len(pose))
+    shape = np.asarray(checks.entry(location, params, "shape"))
+    betas = checks.table(f"{location}.shape", shape[None] if shape.ndim == 1 else shape, 10)
     if len(betas) not in (1, len(pose)):
-        raise BadInput(f"{where}.shape", f"10 numbers, or {len(pose)} rows of them", f"{len(betas)} rows")
+        raise BadInput(f"{location}.shape", f"10 numbers, or {len(pose)} rows of them", f"{len(betas)} rows")
     return to_track(SourceHand(transl, rotation, pose, betas), CONVENTION, hands[side])
 
 
 def _object_model(raw: RawTree, name: str) -> ObjectModel:
-    """The object's bottom.obj and top.obj where the release has both, else mesh.obj divided by parts.json."""
+    """Join bottom.obj and top.obj if the release has both, else split mesh.obj by parts.json."""
     folder = f"meta/object_vtemplates/{name}"
-    mesh_path = _found(raw, f"{folder}/mesh.obj")
-    part_path = _found(raw, f"{folder}/parts.json")
+    mesh_path = _path_in_copy(raw, f"{folder}/mesh.obj")
+    part_path = _path_in_copy(raw, f"{folder}/parts.json")
     mesh = raw_mesh(raw, mesh_path)
     is_base = parse_parts(raw.read(part_path), part_path, len(mesh.vertices))
-    part_paths = [_found(raw, f"{folder}/{half}.obj") for half in ("bottom", "top")]
+    part_paths = [_path_in_copy(raw, f"{folder}/{half}.obj") for half in ("bottom", "top")]
     if all(raw.has(path) for path in part_paths):
         mesh, is_base = _parts_joined([raw_mesh(raw, path) for path in part_paths], part_paths, mesh, mesh_path)
     hinge = Hinge(axis=np.array(HINGE_AXIS), origin_m=np.zeros(3))
-    return ObjectModel(name, mesh.vertices * MILLIMETRES, mesh.faces, (~is_base).astype(np.uint8), hinge)
+    part = (~is_base).astype(np.uint8)
+    return ObjectModel(name, vertices_m=mesh.vertices * MILLIMETRES, faces=mesh.faces, part=part, hinge=hinge)
 
 
 def _parts_joined(parts: list[Mesh], part_paths: list[str], whole: Mesh, whole_path: str) -> tuple[Mesh, np.ndarray]:
-    """Base and moving part as one mesh, and which vertices (vertex,) are the base's.
+    """Join base and moving part to one mesh. Also returns (vertex,) bool, True for the base.
 
-    Raises BadInput where their bounding box is not that of the whole object's mesh, in millimetres.
+    Raises BadInput if their bounding box differs from that of the whole object's mesh.
     """
     base, moving = parts
     joined = Mesh(

@@ -2,7 +2,7 @@
 
 import re
 
-# What GRAB files as ``motion_intent``, and the verb.
+# Verb by ``motion_intent``.
 INTENTS = {
     **{word: word for word in ("browse", "brush", "call", "chop", "clean", "cook", "drink", "eat", "fly", "inspect")},
     **{word: word for word in ("lift", "open", "pass", "peel", "play", "pour", "screw", "see", "set", "shake")},
@@ -12,7 +12,7 @@ INTENTS = {
     "takepicture": "take a picture with",
 }
 _SHAPES, _SIZES = ("cube", "cylinder", "pyramid", "sphere", "torus"), ("small", "medium", "large")
-# The 51 objects that are handled; the sizes of the plain shapes are part of their words.
+# The 51 manipulated objects; sizes of the plain shapes are part of their words.
 OBJECTS = {
     **{shape + size: f"{size} {shape}" for shape in _SHAPES for size in _SIZES},
     **{name: name for name in ("airplane", "apple", "banana", "binoculars", "bowl", "camera", "cup", "doorknob")},
@@ -52,7 +52,7 @@ _NEVER = {
 PAIRS = tuple(
     (INTENTS[intent], words)
     for name, words in OBJECTS.items()
-    for intent in (*_RECORDED[name].split(), *(known for known, names in _NEVER.items() if name not in names))
+    for intent in (*_RECORDED[name].split(), *(general for general, names in _NEVER.items() if name not in names))
 )
 # Further meshes in GRAB's folder of objects.
 OTHER_MESHES = {
@@ -66,10 +66,10 @@ _BEFORE_CAPITAL = re.compile(r"(?<=[a-z])(?=[A-Z])|[_\s-]+")
 
 
 def verb_words(intent: str) -> str | None:
-    """The action in words. An intent GRAB does not have is taken apart where its writing shows words; "" is None."""
+    """The verb of an intent. An unknown intent is split at capitals, ``_``, ``-`` and blanks; "" gives None."""
     return INTENTS.get(intent) or " ".join(_BEFORE_CAPITAL.split(intent)).strip().lower() or None
 
 
 def object_words(name: str) -> str:
-    """GRAB's joined object name in words, size first: ``cubelarge`` is "large cube". Names it lacks stay."""
+    """GRAB's joined object name in words, size first: ``cubelarge`` is "large cube". Unknown names are unchanged."""
     return OBJECTS.get(name) or OTHER_MESHES.get(name, name)

@@ -1,7 +1,7 @@
-"""H2O (Kwon et al. 2021): per-frame text files of five cameras; hands and objects in the camera's frame.
+"""H2O (Kwon et al. 2021): one text file per frame and camera; hands and objects are in the camera's frame.
 
-Only the head camera (cam4) is read, because action labels exist only there. Its pose files are camera-to-world.
-The world's axes are not documented: gravity is estimated from objects at rest, sequence by sequence.
+Only the head camera (cam4) is read, because the others have no action labels. Its pose files are camera to world.
+The world's axes are not documented, so gravity is estimated per sequence from objects at rest.
 """
 
 from collections.abc import Iterator
@@ -14,9 +14,9 @@ import numpy as np
 
 from hoidata.clips.clip import CameraTrack, Clip, ObjectTrack, SourceFile, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention
-from hoidata.dataset_folders import facts_beside
-from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
-from hoidata.datasets.gaps import bridge, has_pose, missing_poses, numbered
+from hoidata.dataset_folders import facts_of_adapter
+from hoidata.datasets.base import AdapterBase, DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.gaps import bridge, has_pose, mark_interpolated, missing_poses
 from hoidata.datasets.gravity import GravityEstimate, TrackedObject, estimate_gravity
 from hoidata.datasets.h2o.files import (
     ACTIONS,
@@ -48,11 +48,11 @@ PARTS = (
 
 
 class _Run(NamedTuple):
-    """Frames ``start`` to ``stop`` (exclusive) of one action. verb: None where labels are withheld."""
+    """An interval of frames of one action."""
 
     start: int
-    stop: int
-    verb: str | None
+    stop: int  # exclusive
+    verb: str | None  # None if labels are withheld
     noun: str
 
 
@@ -62,32 +62,31 @@ class _Object(NamedTuple):
 
 
 class _Sequence(NamedTuple):
-    """What the clips of one sequence share. sources: every file behind them; gravity depends on all the meshes."""
+    """Data that the clips of one sequence share."""
 
     key: SequenceKey
     frames: SequenceFrames
     hands: ParameterHands | KeypointHands
     objects: dict[str, _Object]
     gravity: GravityEstimate
-    sources: tuple[SourceFile, ...]
+    sources: tuple[SourceFile, ...]  # includes all meshes, because gravity depends on them
 
 
 @dataclass(frozen=True)
-class H2OAdapter(Described):
+class H2OAdapter(AdapterBase):
     """Raw root: ``object/<name>/<name>.obj`` and ``subjectN/<place>/<number>/cam4/<kind>/NNNNNN.txt``.
 
-    margin_frames: frames kept before and after each run. shortest_frames: runs must be this long or longer.
-    hands: "mano" reads MANO parameters, which need the licensed MANO files; "keypoints" fits the given hand to the 21
-    joints instead and needs none.
-    Runs are those of the per-frame action labels; for a sequence without any (subject4, whose labels are withheld) the
-    segments of ``label_split``. A run is split where the tracked object is not the one its label names, or, without
-    a label, not the one that is tracked most. Up to three frames without an object are bridged.
+    A clip is a run of frames with one action label. A sequence without labels (subject4, whose labels are withheld)
+    uses the segments of ``label_split``. A run is split at frames in which the tracked object differs from that of the
+    label, or, without a label, from the most frequent one. Gaps of up to three frames without an object are
+    interpolated.
     """
 
-    facts = facts_beside(__file__)
+    facts = facts_of_adapter(__file__)
     without_mano = "hands=keypoints"
-    margin_frames: int = 0
-    shortest_frames: int = 21
+    margin_frames: int = 0  # frames kept before and after each run
+    shortest_frames: int = 21  # shorter runs give no clip
+    # "mano": MANO parameters, which need the licensed MANO files; "keypoints": a hand model fitted to the 21 joints
     hands: HandSource = "mano"
     frame: WorldFrame = FRAME
     parts: tuple[DatasetPart, ...] = PARTS
@@ -98,35 +97,37 @@ class H2OAdapter(Described):
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per ``subjectN/<place>/<number>`` that has a cam4 folder."""
-        found = sorted(Path(root).glob(f"subject*/*/*/{CAMERA}"))
-        parts = [path.relative_to(root).parts for path in found if path.is_dir()]
+        folders = sorted(Path(root).glob(f"subject*/*/*/{CAMERA}"))
+        parts = [path.relative_to(root).parts for path in folders if path.is_dir()]
         return [SequenceKey(self.name, part[0], "/".join(part[:3])) for part in parts]
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
-        """One clip per run of frames of one action on the object tracked there; runs that give none, with reasons."""
+        """One clip per run of frames of one action on one tracked object, and reasons for runs without a clip."""
         frames = read_frames(raw, f"{key.name}/{CAMERA}", self.hands)
-        found = list(self._runs(raw, key, frames))
-        runs = [item for item in found if isinstance(item, _Run)]
+        runs_and_reasons = list(self._runs(raw, key, frames))
+        runs = [item for item in runs_and_reasons if isinstance(item, _Run)]
         if not runs:
-            return [item for item in found if isinstance(item, Quarantined)]
+            return [item for item in runs_and_reasons if isinstance(item, Quarantined)]
         paths = {noun: _mesh_path(raw, noun) for noun in sorted({run.noun for run in runs})}
         objects = {noun: _object(noun, raw.file(path), raw.recorded(path)[0].sha256) for noun, path in paths.items()}
-        own_hands = ParameterHands(frames, hands) if self.needs_mano else KeypointHands(frames, hands)
-        gravity = estimate_gravity(_tracked_objects(frames, objects), own_hands.joints_m(), frames.camera[:, :3, :3])
+        hand_source = ParameterHands(frames, hands) if self.needs_mano else KeypointHands(frames, hands)
+        gravity = estimate_gravity(_tracked_objects(frames, objects), hand_source.joints_m(), frames.camera[:, :3, :3])
         sources = raw.recorded(frames.folder, LISTS, *paths.values())
-        sequence = _Sequence(key, frames, own_hands, objects, gravity, sources)
-        return [item if isinstance(item, Quarantined) else self._clip(sequence, item) for item in found]
+        sequence = _Sequence(
+            key=key, frames=frames, hands=hand_source, objects=objects, gravity=gravity, sources=sources
+        )
+        return [item if isinstance(item, Quarantined) else self._clip(sequence, item) for item in runs_and_reasons]
 
     def _runs(self, raw: RawTree, key: SequenceKey, frames: SequenceFrames) -> Iterator[_Run | Quarantined]:
-        """Runs of the labels, or the list's segments, cut to the frames in which their object is tracked."""
-        known: set[tuple[int, int]] = set()
-        for start, stop, label, where in _wanted(raw, key, frames):
+        """Runs of the labels or segments of the list, cut to frames in which their object is tracked."""
+        earlier_intervals: set[tuple[int, int]] = set()
+        for start, stop, label, location in _labelled_ranges(raw, key, frames):
             clip_id = _clip_id(key, frames, start, stop)
             try:
-                for piece in _tracked_pieces(frames, start, stop, label, self.shortest_frames, where):
-                    if (piece.start, piece.stop) in known:
-                        raise BadInput(where, "each stretch once", f"{clip_id} twice", "correct the list")
-                    known.add((piece.start, piece.stop))
+                for piece in _tracked_pieces(frames, start, stop, label, self.shortest_frames, location):
+                    if (piece.start, piece.stop) in earlier_intervals:
+                        raise BadInput(location, "each stretch once", f"{clip_id} twice", "correct the list")
+                    earlier_intervals.add((piece.start, piece.stop))
                     yield piece
                 tracked, inside = frames.classes == frames.classes[piece.start], slice(start, stop)
                 numbers, noun = frames.first + np.arange(len(frames))[inside], OBJECTS[frames.classes[piece.start]]
@@ -157,7 +158,7 @@ class H2OAdapter(Described):
                 ),
                 tracked[start:stop],
             ),
-            source_frames=numbered(source_frames, tracked[start:stop]),
+            source_frames=mark_interpolated(source_frames, tracked[start:stop]),
             gravity=sequence.gravity.direction,
             gravity_note=sequence.gravity.note,
             verb=run.verb,
@@ -171,16 +172,19 @@ class H2OAdapter(Described):
 
 
 def label_runs(label: np.ndarray) -> list[tuple[int, int]]:
-    """Half-open ranges of one non-zero label. label: (frame,) int."""
+    """Half-open ranges of equal non-zero labels. label: (frame,) int."""
     edges = np.flatnonzero(np.diff(label)) + 1
     starts, stops = np.r_[0, edges], np.r_[edges, len(label)]
     return [(int(a), int(b)) for a, b in zip(starts, stops, strict=True) if label[a] != 0]
 
 
-def _wanted(raw: RawTree, key: SequenceKey, frames: SequenceFrames) -> Iterator[tuple[int, int, int | None, str]]:
-    """Start, stop (exclusive), action and its source of each run, as the labels say, or else the segment lists.
+def _labelled_ranges(
+    raw: RawTree, key: SequenceKey, frames: SequenceFrames
+) -> Iterator[tuple[int, int, int | None, str]]:
+    """Yield start, stop (exclusive), action label and location of each run, from labels or from a segment list.
 
-    Raises BadInput where neither is there, or the list speaks of frames that are not.
+    Raises:
+        BadInput: neither labels nor a list, or the list names missing frames.
     """
     if frames.label is not None and frames.label.any():
         for start, stop in label_runs(frames.label):
@@ -203,29 +207,33 @@ def _wanted(raw: RawTree, key: SequenceKey, frames: SequenceFrames) -> Iterator[
 
 
 def _tracked_pieces(
-    frames: SequenceFrames, start: int, stop: int, label: int | None, shortest: int, where: str
+    frames: SequenceFrames, start: int, stop: int, label: int | None, shortest: int, location: str
 ) -> list[_Run]:
-    """The parts of a run, ``shortest`` frames or longer, in which its object is tracked. Raises BadInput for none.
+    """Intervals of a run, at least ``shortest`` frames long, in which its object is tracked. Raises BadInput for none.
 
-    The object is the one the label names; without a label the one tracked in most frames (the first of equals).
+    The object is that of the label. Without a label it is the most frequent one (the first of equals).
     """
     named_frames = f"frames {frames.first + start} to {frames.first + stop - 1}"
     if stop - start < shortest:
         got, remedy = f"{stop - start} ({named_frames})", "nothing to do, or lower the setting shortest_frames"
-        raise BadInput(where, f"a run of {shortest} frames or more", got, remedy)
+        raise BadInput(location, f"a run of {shortest} frames or more", got, remedy)
     classes = frames.classes[start:stop]
-    counts = np.bincount(classes[classes > 0], minlength=len(OBJECTS))
-    wanted = int(counts.argmax()) if label is None else OBJECTS.index(ACTIONS[label][1])
-    # Short gaps are bridged, but not frames in which another object is said to be tracked.
-    known = has_pose(classes == wanted) & np.isin(classes, (0, wanted))
-    long = [(first, last) for first, last in runs(known) if last - first >= shortest]
-    if not counts.any() or not long:
-        thing = "one object" if label is None else f"class {wanted} ({OBJECTS[wanted]}), the object of action {label},"
+    class_counts = np.bincount(classes[classes > 0], minlength=len(OBJECTS))
+    target_class = int(class_counts.argmax()) if label is None else OBJECTS.index(ACTIONS[label][1])
+    # Short gaps are interpolated, unless another object is tracked in them.
+    has_target_pose = has_pose(classes == target_class) & np.isin(classes, (0, target_class))
+    accepted = [(first, last) for first, last in runs(has_target_pose) if last - first >= shortest]
+    if not class_counts.any() or not accepted:
+        object_in_words = (
+            "one object"
+            if label is None
+            else f"class {target_class} ({OBJECTS[target_class]}), the object of action {label},"
+        )
         got = f"classes {np.unique(classes).tolist()} ({named_frames})"
-        expected = f"{thing} for {shortest} frames or more"
+        expected = f"{object_in_words} for {shortest} frames or more"
         raise BadInput(f"{frames.folder}/obj_pose_rt", expected, got, "check the annotation")
     verb = None if label is None else ACTIONS[label][0]
-    return [_Run(start + first, start + last, verb, OBJECTS[wanted]) for first, last in long]
+    return [_Run(start + first, start + last, verb, OBJECTS[target_class]) for first, last in accepted]
 
 
 def _clip_id(key: SequenceKey, frames: SequenceFrames, start: int, stop: int) -> str:
@@ -235,33 +243,37 @@ def _clip_id(key: SequenceKey, frames: SequenceFrames, start: int, stop: int) ->
 def _camera_track(frames: SequenceFrames, start: int, stop: int, images: np.ndarray) -> CameraTrack:
     poses = frames.camera[start:stop]
     rotvec = rotmat_to_rotvec(poses[:, :3, :3]).astype(np.float32)
-    return CameraTrack(CAMERA, rotvec, poses[:, :3, 3].astype(np.float32), images, frames.intrinsics)
+    return CameraTrack(
+        name=CAMERA,
+        rotvec=rotvec,
+        position_m=poses[:, :3, 3].astype(np.float32),
+        images=images,
+        intrinsics=frames.intrinsics,
+    )
 
 
 def _tracked_objects(frames: SequenceFrames, objects: dict[str, _Object]) -> list[TrackedObject]:
     poses = frames.camera @ _poses(frames)
-    return [
-        TrackedObject(thing.footing, frames.classes == OBJECTS.index(noun), poses) for noun, thing in objects.items()
-    ]
+    return [TrackedObject(item.footing, frames.classes == OBJECTS.index(noun), poses) for noun, item in objects.items()]
 
 
 def _poses(frames: SequenceFrames) -> np.ndarray:
-    """(frame, 4, 4) camera from object; the identity in frames without an object, which may hold anything."""
+    """(frame, 4, 4) camera from object; the identity in frames without an object, whose numbers are undefined."""
     return np.where(frames.classes[:, None, None] == 0, np.eye(4), frames.objects)
 
 
 def _mesh_path(raw: RawTree, name: str) -> str:
-    for known in (name, OLD_NAMES.get(name, name)):
-        exact = f"{known}.obj"
-        names = raw.names(f"object/{known}", ".obj")
+    for candidate in (name, OLD_NAMES.get(name, name)):
+        exact = f"{candidate}.obj"
+        names = raw.names(f"object/{candidate}", ".obj")
         if names:
-            return f"object/{known}/{exact if exact in names else names[0]}"
+            return f"object/{candidate}/{exact if exact in names else names[0]}"
     raise BadInput(f"object/{name}/{name}.obj", "the object's mesh", "nothing there", "unpack object.zip here")
 
 
 @lru_cache(maxsize=16)
-def _object(name: str, place: Path, sha256: str) -> _Object:
-    """The mesh read from ``place``; sha256 tells whether it is still the same file: sequences share few objects."""
-    mesh = load_mesh(place)
+def _object(name: str, file: Path, sha256: str) -> _Object:
+    """Read a mesh, cached because sequences share objects. sha256: makes a changed file another cache entry."""
+    mesh = load_mesh(file)
     model = ObjectModel(name, mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), dtype=np.uint8))
     return _Object(model, footing(mesh.vertices, mesh.faces))

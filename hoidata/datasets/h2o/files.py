@@ -1,8 +1,7 @@
-"""H2O's text files: frame files of one line of numbers, and the lists of segments in label_split.
+"""Readers of H2O's text files: one line of numbers per frame file, and lists of segments in label_split.
 
-Objects by class id and actions by label are as the dataset's README lists them.
-
-Layouts: Kwon et al. 2021, README of the dataset; a hand's MANO block has 62 numbers, not the 59 printed there.
+Class ids, action labels and layouts follow the dataset's README (Kwon et al. 2021), except that a hand's MANO block has
+62 numbers and not 59.
 """
 
 import re
@@ -50,45 +49,41 @@ _LONGEST_NUMBER = 9  # digits of a frame number that is one
 
 @dataclass(frozen=True)
 class SequenceFrames:
-    """The numbers of one sequence, frame axis first, as in the files (camera frame, metres).
+    """The numbers of one sequence as in the files (camera frame, metres)."""
 
-    folder: of the camera; first: number of the first frame. camera: (frame, 4, 4) world from camera.
-    hands: (frame, 124) of hand_pose_mano or (frame, 128) of hand_pose. classes: (frame,) int class of the tracked
-    object, 0 for none; objects: (frame, 4, 4) camera from object. label: (frame,) int action, or None where action
-    labels are withheld. intrinsics: (6,) or None.
-    """
-
-    folder: str
-    first: int
-    camera: np.ndarray
-    hands: np.ndarray
-    classes: np.ndarray
-    objects: np.ndarray
-    label: np.ndarray | None
-    intrinsics: np.ndarray | None
+    folder: str  # of the camera
+    first: int  # number of the first frame
+    camera: np.ndarray  # (frame, 4, 4) world from camera
+    hands: np.ndarray  # (frame, 124) of hand_pose_mano or (frame, 128) of hand_pose
+    classes: np.ndarray  # (frame,) int class of the tracked object, 0 for none
+    objects: np.ndarray  # (frame, 4, 4) camera from object
+    label: np.ndarray | None  # (frame,) int action; None if labels are withheld
+    intrinsics: np.ndarray | None  # (6,)
 
     def __len__(self) -> int:
         return len(self.classes)
 
 
 class Segment(NamedTuple):
-    """One row of a segment list. label: action, None where it is withheld; frame numbers, both ends inclusive."""
+    """One row of a segment list."""
 
     sequence: str
-    label: int | None
-    start: int
-    last: int
-    first_frame: int
-    last_frame: int
+    label: int | None  # action; None if it is withheld
+    start: int  # first frame of the action
+    last: int  # last frame of the action, inclusive
+    first_frame: int  # of the sequence
+    last_frame: int  # of the sequence, inclusive
 
 
 def read_frames(raw: RawTree, folder: str, hands: HandSource) -> SequenceFrames:
-    """All frame files of one camera's folder. Raises BadInput that names the file that is missing or cannot be used."""
+    """Read all frame files of one camera's folder. Raises BadInput that names a missing or unusable file."""
     hand_folder, hand_columns = HAND_FOLDERS[hands]
     kinds = {kind: _folder_of(raw, folder, kind) for kind in ("cam_pose", hand_folder, "obj_pose_rt", "action_label")}
     labelled = bool(_frame_files(raw, kinds["action_label"]))
     _refuse_other_hands(raw, folder, kinds[hand_folder], hands)
-    files = _common_files(raw, [place for kind, place in kinds.items() if labelled or kind != "action_label"])
+    files = _common_files(
+        raw, [folder_path for kind, folder_path in kinds.items() if labelled or kind != "action_label"]
+    )
     camera = _read(raw, kinds["cam_pose"], files, 16).reshape(-1, 4, 4)
     objects = _read(raw, kinds["obj_pose_rt"], files, 17)
     hand_numbers = _read(raw, kinds[hand_folder], files, hand_columns)
@@ -114,9 +109,19 @@ def read_frames(raw: RawTree, folder: str, hands: HandSource) -> SequenceFrames:
 
 
 def parse_rows(contents: Sequence[bytes], columns: int, folder: str, names: Sequence[str]) -> np.ndarray:
-    """(file, column) float64 from the first line of each file, bit for bit what ``np.loadtxt`` reads there.
+    """Parse the first line of each file, bit for bit like ``np.loadtxt``.
 
-    folder and names say whose bytes these are. Raises BadInput for another count of numbers, or ones not finite.
+    Args:
+        contents: bytes of each file.
+        columns: required count of numbers.
+        folder: of the files, for errors.
+        names: of the files, for errors.
+
+    Returns:
+        (file, column) float64.
+
+    Raises:
+        BadInput: another count of numbers, NaN or infinity.
     """
     lines = [data.partition(b"\n")[0].strip() for data in contents]
     values = _parse_as_json(lines, columns)
@@ -129,40 +134,38 @@ def parse_rows(contents: Sequence[bytes], columns: int, folder: str, names: Sequ
     return values
 
 
-def parse_segments(data: bytes, where: str) -> list[Segment]:
-    """Rows of action_train.txt, action_val.txt or action_test.txt (the last without labels); blank lines are ignored.
+def parse_segments(data: bytes, path: str) -> list[Segment]:
+    """Read action_train.txt, action_val.txt or action_test.txt, which has no labels. Ignores blank lines.
 
-    Raises BadInput that names the line for another header or a row that does not fit it.
+    Raises BadInput that names the line for another header or a malformed row.
     """
     try:
         lines = data.decode("utf-8").split("\n")
     except UnicodeDecodeError as error:
-        raise BadInput(where, "UTF-8 text", str(error)) from error
+        raise BadInput(path, "UTF-8 text", str(error)) from error
     header = lines[0].split()
     if tuple(header) not in (_LIST_COLUMNS, tuple(name for name in _LIST_COLUMNS if name != "action_label")):
-        raise BadInput(
-            where, f"the header {' '.join(_LIST_COLUMNS)}, or that without action_label", repr(lines[0][:80])
-        )
-    numbered = ((f"{where}:{number}", line.split()) for number, line in enumerate(lines[1:], 2))
-    return [_segment(header, words, place) for place, words in numbered if words]
+        raise BadInput(path, f"the header {' '.join(_LIST_COLUMNS)}, or that without action_label", repr(lines[0][:80]))
+    located_rows = ((f"{path}:{number}", line.split()) for number, line in enumerate(lines[1:], 2))
+    return [_segment(header, words, location) for location, words in located_rows if words]
 
 
 def listed_segments(raw: RawTree, sequence: str) -> tuple[list[Segment], str]:
-    """The segments of one sequence and the list they stand in; none and "" where no list names it."""
+    """The segments of one sequence and the path of their list; empty and "" if no list names the sequence."""
     for name in raw.names(LISTS, ".txt"):
         if _LIST_FILE.fullmatch(name):
             path = f"{LISTS}/{name}"
-            listed = parse_segments(raw.read(path, _LARGEST_LIST), path)
-            own = [segment for segment in listed if segment.sequence == sequence]
-            if own:
-                return sorted(own, key=lambda segment: segment.start), path
+            segments = parse_segments(raw.read(path, _LARGEST_LIST), path)
+            matching = [segment for segment in segments if segment.sequence == sequence]
+            if matching:
+                return sorted(matching, key=lambda segment: segment.start), path
     return [], ""
 
 
 def _parse_as_json(lines: list[bytes], columns: int) -> np.ndarray | None:
-    """All lines in one go; None where a line is not plain JSON numbers with single spaces between.
+    """Parse all lines in one call, which is fast. Returns None unless they are JSON numbers with single spaces.
 
-    Only characters of numbers are let through, so that JSON cannot mean anything else; "-0" has no sign in JSON.
+    The check of characters excludes other JSON values. "-0" is excluded because JSON drops its sign.
     """
     if b"".join(lines).translate(None, b"0123456789+-.eE "):
         return None
@@ -176,16 +179,16 @@ def _parse_as_json(lines: list[bytes], columns: int) -> np.ndarray | None:
     return np.array(rows, dtype=np.float64) if set(map(len, rows)) == {columns} else None
 
 
-def _parse_line(line: bytes, columns: int, where: str) -> list[float]:
+def _parse_line(line: bytes, columns: int, path: str) -> list[float]:
     words = line.split()
     if len(words) != columns:
-        raise BadInput(where, f"{columns} numbers", f"{len(words)}")
+        raise BadInput(path, f"{columns} numbers", f"{len(words)}")
     try:
         if b"_" in line:  # float() takes 1_0 for 10
             raise ValueError(f"could not convert {line[:40]!r}")
         return [float(word) for word in words]
     except ValueError as error:
-        raise BadInput(where, f"{columns} numbers", str(error)[:120]) from error
+        raise BadInput(path, f"{columns} numbers", str(error)[:120]) from error
 
 
 def _read(raw: RawTree, folder: str, files: list[str], columns: int) -> np.ndarray:
@@ -193,60 +196,60 @@ def _read(raw: RawTree, folder: str, files: list[str], columns: int) -> np.ndarr
 
 
 def _folder_of(raw: RawTree, folder: str, kind: str) -> str:
-    """The real name of a folder whose case differs between releases (hand_pose_mano, hand_pose_MANO)."""
-    place = raw.root / folder
-    found = sorted(item.name for item in place.iterdir() if item.name.lower() == kind)
-    return f"{folder}/{found[-1] if found else kind}"
+    """The path of a folder whose case differs between releases (hand_pose_mano, hand_pose_MANO)."""
+    folder_path = raw.root / folder
+    matching = sorted(item.name for item in folder_path.iterdir() if item.name.lower() == kind)
+    return f"{folder}/{matching[-1] if matching else kind}"
 
 
 def _frame_files(raw: RawTree, folder: str) -> set[str]:
     return {name for name in raw.names(folder) if _FRAME_FILE.fullmatch(name)}
 
 
-def _refuse_other_hands(raw: RawTree, folder: str, wanted_folder: str, wanted: HandSource) -> None:
-    """Raise BadInput that names the setting where a copy has hands of the other kind alone."""
-    other: HandSource = "keypoints" if wanted == "mano" else "mano"
-    if not _frame_files(raw, wanted_folder) and _frame_files(raw, _folder_of(raw, folder, HAND_FOLDERS[other][0])):
+def _refuse_other_hands(raw: RawTree, folder: str, hand_folder: str, hand_source: HandSource) -> None:
+    """Raise BadInput that names the setting if a copy has only hands of the other kind."""
+    other: HandSource = "keypoints" if hand_source == "mano" else "mano"
+    if not _frame_files(raw, hand_folder) and _frame_files(raw, _folder_of(raw, folder, HAND_FOLDERS[other][0])):
         remedy = f"download the pose archive of this subject, or set hands: {other}, which reads what is there"
-        raise BadInput(wanted_folder, "a folder of NNNNNN.txt files", "none", remedy)
+        raise BadInput(hand_folder, "a folder of NNNNNN.txt files", "none", remedy)
 
 
 def _common_files(raw: RawTree, folders: list[str]) -> list[str]:
-    """Names of the frame files, the same in every folder and without a gap; else BadInput names the missing one."""
+    """Names of the frame files. Raises BadInput that names a missing file if folders differ or frames have a gap."""
     names = {folder: _frame_files(raw, folder) for folder in folders}
-    for folder, found in names.items():
-        if not found:
+    for folder, frame_files in names.items():
+        if not frame_files:
             raise BadInput(folder, "a folder of NNNNNN.txt files", "none", "download the pose archive of this subject")
     numbers = sorted(int(name[:6]) for name in set().union(*names.values()))
     expected = [f"{number:06d}.txt" for number in range(numbers[0], numbers[-1] + 1)]
-    for folder, found in names.items():
-        missing = next((name for name in expected if name not in found), None)
+    for folder, frame_files in names.items():
+        missing = next((name for name in expected if name not in frame_files), None)
         if missing is not None:
             raise BadInput(f"{folder}/{missing}", f"one file for each of {len(expected)} frames", "nothing there")
     return expected
 
 
 def _check_ids(folder: str, files: list[str], values: np.ndarray, count: int) -> None:
-    known = np.isin(values, np.arange(count))
-    if not known.all():
-        at = int(np.argmin(known))
-        raise BadInput(f"{folder}/{files[at]}", f"a whole number from 0 to {count - 1}", f"{values[at]}")
+    is_known = np.isin(values, np.arange(count))
+    if not is_known.all():
+        index = int(np.argmin(is_known))
+        raise BadInput(f"{folder}/{files[index]}", f"a whole number from 0 to {count - 1}", f"{values[index]}")
 
 
-def _segment(header: list[str], words: list[str], where: str) -> Segment:
+def _segment(header: list[str], words: list[str], location: str) -> Segment:
     if len(words) != len(header):
-        raise BadInput(where, f"{len(header)} words", f"{len(words)}")
-    row = dict(zip(header, words, strict=True))
-    path = row.pop("path")
+        raise BadInput(location, f"{len(header)} words", f"{len(words)}")
+    words_by_column = dict(zip(header, words, strict=True))
+    path = words_by_column.pop("path")
     if not _SEQUENCE.fullmatch(path):
-        raise BadInput(where, "a path like subject1/h1/0", repr(path[:80]))
-    for name, word in row.items():
+        raise BadInput(location, "a path like subject1/h1/0", repr(path[:80]))
+    for name, word in words_by_column.items():
         if not (word.isascii() and word.isdigit() and len(word) <= _LONGEST_NUMBER):
-            raise BadInput(where, f"a whole number as {name}", repr(word[:80]))
-    numbers = {name: int(word) for name, word in row.items()}
+            raise BadInput(location, f"a whole number as {name}", repr(word[:80]))
+    numbers = {name: int(word) for name, word in words_by_column.items()}
     label = numbers.get("action_label")
     if label is not None and not 0 < label < len(ACTIONS):
-        raise BadInput(where, f"an action label from 1 to {len(ACTIONS) - 1}", f"{label}")
+        raise BadInput(location, f"an action label from 1 to {len(ACTIONS) - 1}", f"{label}")
     if numbers["start_act"] > numbers["end_act"]:
-        raise BadInput(where, "a first frame before the last", f"{numbers['start_act']} to {numbers['end_act']}")
+        raise BadInput(location, "a first frame before the last", f"{numbers['start_act']} to {numbers['end_act']}")
     return Segment(path, label, *(numbers[name] for name in _LIST_COLUMNS[3:]))

@@ -1,4 +1,4 @@
-"""H2O's hands in the world: from MANO parameters, or fitted to the 21 joints so that no MANO file is needed."""
+"""H2O's hands in the world: from MANO parameters, or fitted to the 21 joints, which needs no MANO file."""
 
 from dataclasses import dataclass
 
@@ -31,19 +31,17 @@ _PARAMETERS, _KEYPOINTS = 62, 64  # numbers of one hand; left comes first
 
 @dataclass(frozen=True)
 class ParameterHands:
-    """Hands from ``hand_pose_mano``: left then right: flag, transl 3, orient 3, fingers 45, betas 10.
-
-    tracks: frames ``start`` to ``stop`` (exclusive), and the mean error of the fit in metres where there was one.
-    joints_m: (frame, 42, 3) of left and right hand in every frame; NaN where a hand is not annotated.
-    """
+    """Hands from ``hand_pose_mano``: left then right: flag, transl 3, orient 3, fingers 45, betas 10."""
 
     frames: SequenceFrames
     models: HandPair
 
     def tracks(self, start: int, stop: int) -> tuple[dict[Side, HandTrack], float | None]:
+        """Hands of frames ``start`` to ``stop`` (exclusive), and None in place of a fit error."""
         return {side: self._track(side, slice(start, stop)) for side in SIDES}, None
 
     def joints_m(self) -> np.ndarray:
+        """(frame, 42, 3) joints of left and right hand in the world, metres; NaN if a hand is not annotated."""
         return np.concatenate([self._side_joints_m(side) for side in SIDES], axis=1)
 
     def _side_joints_m(self, side: Side) -> np.ndarray:
@@ -66,33 +64,32 @@ class ParameterHands:
 
 
 class KeypointHands:
-    """Hands from ``hand_pose``: left then right: flag, 21 joints in OpenPose's order. One shape for the sequence.
-
-    Asked as ``ParameterHands`` are.
-    """
+    """Hands from ``hand_pose``: left then right: flag, 21 joints in OpenPose's order. One shape for the sequence."""
 
     def __init__(self, frames: SequenceFrames, models: HandPair) -> None:
         self.models = models
         self.points: dict[Side, np.ndarray] = {side: _world_joints(frames, side) for side in SIDES}
-        known: dict[Side, np.ndarray] = {side: self.points[side][_known(self.points[side])] for side in SIDES}
-        seen: dict[Side, np.ndarray] = {side: known[side] for side in SIDES if len(known[side])}
-        self.betas = fit_shape(seen, models) if seen else np.zeros(10)
+        valid_points: dict[Side, np.ndarray] = {side: self.points[side][_is_valid(self.points[side])] for side in SIDES}
+        present_points: dict[Side, np.ndarray] = {side: valid_points[side] for side in SIDES if len(valid_points[side])}
+        self.betas = fit_shape(present_points, models) if present_points else np.zeros(10)
 
     def joints_m(self) -> np.ndarray:
+        """(frame, 42, 3) joints of left and right hand in the world, metres; NaN if a hand is not annotated."""
         return np.concatenate([self.points[side] for side in SIDES], axis=1)
 
     def tracks(self, start: int, stop: int) -> tuple[dict[Side, HandTrack], float | None]:
+        """Fitted hands of frames ``start`` to ``stop`` (exclusive), and the mean fit error in metres."""
         tracks: dict[Side, HandTrack] = {}
         errors = []
         for side in SIDES:
             tracks[side], error = self._fit(side, self.points[side][start:stop])
             errors.append(error)
-        every = np.concatenate(errors)
-        return tracks, float(every.mean()) if len(every) else None
+        all_errors = np.concatenate(errors)
+        return tracks, float(all_errors.mean()) if len(all_errors) else None
 
     def _fit(self, side: Side, points: np.ndarray) -> tuple[HandTrack, np.ndarray]:
-        """The track and the error (valid frame, 21) of one hand: each stretch of valid frames is fitted by itself."""
-        valid = _known(points)
+        """Fit one hand, each run of valid frames separately. Returns track and (valid frame, 21) error in metres."""
+        valid = _is_valid(points)
         numbers, errors = np.zeros((len(points), 3 + 3 + 45)), [np.zeros((0, 21))]
         for first, last in runs(valid):
             fit = fit_hands({side: points[first:last]}, self.models, self.betas)[side]
@@ -102,13 +99,13 @@ class KeypointHands:
         return track, np.concatenate(errors)
 
 
-def _known(points: np.ndarray) -> np.ndarray:
+def _is_valid(points: np.ndarray) -> np.ndarray:
     return np.asarray(np.isfinite(points).all(axis=(1, 2)))
 
 
 def _world_joints(frames: SequenceFrames, side: Side) -> np.ndarray:
-    """(frame, 21, 3) in hoidata's order and the world, metres; NaN where the flag is 0."""
+    """(frame, 21, 3) joints in hoidata's order and the world, metres; NaN if the flag is 0."""
     block = frames.hands[:, :_KEYPOINTS] if side == "left" else frames.hands[:, _KEYPOINTS:]
-    seen = openpose_to_mano_order(block[:, 1:].reshape(-1, 21, 3))
-    world = seen @ frames.camera[:, :3, :3].transpose(0, 2, 1) + frames.camera[:, None, :3, 3]
-    return np.where(block[:, :1, None] != 0, world, np.nan)
+    joints_camera = openpose_to_mano_order(block[:, 1:].reshape(-1, 21, 3))
+    joints_world = joints_camera @ frames.camera[:, :3, :3].transpose(0, 2, 1) + frames.camera[:, None, :3, 3]
+    return np.where(block[:, :1, None] != 0, joints_world, np.nan)

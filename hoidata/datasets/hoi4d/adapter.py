@@ -1,7 +1,7 @@
 """HOI4D (Liu et al. 2022): a head-worn camera, MANO hands, rigid and hinged objects, 15 frames per second.
 
-All numbers are in the camera's frame; the world is that of the camera's own trajectory, whose axes nobody states. Clips
-have 30 frames per second, of which every second one is made (``twice_frames``).
+All numbers are in the camera's frame. The world is that of the camera's trajectory, whose axes are not documented.
+Clips have 30 frames per second, of which every second one is interpolated (``parts.upsample_frames``).
 """
 
 from collections.abc import Iterator
@@ -13,9 +13,9 @@ import numpy as np
 
 from hoidata.clips.clip import SIDES, CameraTrack, Clip, HandTrack, HandType, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import FrameChange, HandConvention, SourceHand, to_track
-from hoidata.dataset_folders import facts_beside
-from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
-from hoidata.datasets.gaps import bridge, has_pose, missing_poses, numbered, trimmed
+from hoidata.dataset_folders import facts_of_adapter
+from hoidata.datasets.base import AdapterBase, DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.gaps import bridge, has_pose, mark_interpolated, missing_poses, trim_to_recorded
 from hoidata.datasets.gravity import TrackedObject, estimate_gravity
 from hoidata.datasets.hinge import box_corners, fit_hinge, hinged_model
 from hoidata.datasets.hoi4d.files import (
@@ -34,11 +34,11 @@ from hoidata.datasets.hoi4d.files import (
 )
 from hoidata.datasets.hoi4d.parts import (
     aligned_from_whole,
-    matched,
-    twice_frames,
-    twice_hand,
-    twice_rotvecs,
-    twice_values,
+    match_boxes,
+    upsample_frames,
+    upsample_hand,
+    upsample_rotvecs,
+    upsample_values,
 )
 from hoidata.datasets.known_meshes import raw_mesh
 from hoidata.errors import BadInput
@@ -50,7 +50,10 @@ from hoidata.objects.resting import footing
 
 ANNOTATIONS, MODELS = "HOI4D_annotations", "HOI4D_CAD_Model_for_release"
 CLIP = "ZY*/H*/C*/N*/S*/s*/T*"
-HAND_FOLDERS = ("handpose/refinehandpose_{}", "Hand_pose/handpose_{}_hand")  # an older download, the current one
+HAND_FOLDERS = (
+    "handpose/refinehandpose_{}",
+    "Hand_pose/handpose_{}_hand",
+)  # of an older download and of the current one
 FRAME = WorldFrame(None, "estimated", "the world of the camera's trajectory, right-handed, metres, axes not documented")
 CONVENTION = HandConvention(
     translation="transl",
@@ -59,7 +62,7 @@ CONVENTION = HandConvention(
     left_shape="as released",
     note="MANO: absolute axis-angles, one shape per person, translation added to the rest wrist, camera frame",
 )
-# A folder of frame files is one source, so it is named as well as its files.
+# A folder of frame files is recorded as one source, so a pattern for the folder is needed too.
 _HANDS = tuple(
     f"{folder.format(side)}/{CLIP}{files}" for folder in HAND_FOLDERS for side in SIDES for files in ("/*.pickle", "")
 )
@@ -79,46 +82,39 @@ PARTS = (
     ),
 )
 EVENT_FILES = (f"{ANNOTATIONS}/{CLIP}/action/color.json",)
-Cut = Literal["described", "whole"]
+ClipSource = Literal["described", "whole"]
 
 
-class _Object(NamedTuple):
-    """track, tracked (frame,): at 30 fps, short gaps bridged and poses of the source or made between two of them.
+class _ObjectMotion(NamedTuple):
+    """Motion of the object at 30 fps."""
 
-    recorded: (frame,) poses of the source. note: how boxes and hinge fit. left_out: frames too far off the hinge.
-    """
-
-    track: ObjectTrack
-    tracked: np.ndarray
-    recorded: np.ndarray
-    note: str
-    left_out: list[Quarantined]
+    track: ObjectTrack  # short gaps are interpolated
+    tracked: np.ndarray  # (frame,) bool: a pose of the source, or interpolated between two neighbours
+    recorded: np.ndarray  # (frame,) bool: a pose of the source
+    note: str  # residuals of boxes and hinge
+    rejected_frames: list[Quarantined]  # frames that are too far off the hinge
 
 
-class _Wanted(NamedTuple):
-    """A range of source frames, half-open. verb, hand: as the source says, else None. clip_id: where it is whole."""
+class _ClipRange(NamedTuple):
+    """A range of source frames that becomes one clip, or several if object poses are missing."""
 
-    clip_id: str
+    clip_id: str  # if it becomes one clip
     start: int
-    stop: int
-    verb: str | None
-    hand: HandType | None
+    stop: int  # exclusive
+    verb: str | None  # None if the source does not state it
+    hand: HandType | None  # None if the source does not state it
 
 
 @dataclass(frozen=True)
-class Hoi4dAdapter(Described):
-    """Raw root: the folder with ``HOI4D_annotations``, the CAD models, and ``handpose`` or ``Hand_pose``.
+class Hoi4dAdapter(AdapterBase):
+    """Raw root: the folder with ``HOI4D_annotations``, the CAD models, and ``handpose`` or ``Hand_pose``."""
 
-    clips: "described" gives one clip per event of ``action/color.json`` in which something is done to the object;
-    "whole" one clip per recording. margin_frames: kept before and after each event; shortest_frames: shorter ones are
-    no clips; both at 30 fps. most_off_mm, most_off_deg: frames in which two tracked parts lie farther off their hinge
-    are left out.
-    """
-
-    facts = facts_beside(__file__)
-    margin_frames: int = 0
-    shortest_frames: int = 20
-    clips: Cut = "described"
+    facts = facts_of_adapter(__file__)
+    margin_frames: int = 0  # at 30 fps: frames kept before and after each event
+    shortest_frames: int = 20  # at 30 fps: shorter events give no clip
+    # "described": one clip per event of ``action/color.json`` that acts on the object; "whole": one clip per recording
+    clips: ClipSource = "described"
+    # Frames in which two tracked parts are farther off their hinge are excluded.
     most_off_mm: int = 20
     most_off_deg: int = 10
     frame: WorldFrame = FRAME
@@ -126,91 +122,105 @@ class Hoi4dAdapter(Described):
 
     @property
     def parts(self) -> tuple[DatasetPart, ...]:
-        """Events are needed only where clips are cut by them."""
+        """Files of a complete raw folder. Events are required for the setting ``clips: described`` only."""
         optional = self.clips == "whole"
-        return (*PARTS, DatasetPart("events", EVENT_FILES, "HOI4D_annotations.zip", optional, "clips=whole"))
+        events = DatasetPart(
+            contents="events",
+            patterns=EVENT_FILES,
+            archive="HOI4D_annotations.zip",
+            optional=optional,
+            unneeded_with="clips=whole",
+        )
+        return (*PARTS, events)
 
     def sequences(self, root: Path) -> list[SequenceKey]:
-        """One key per recording that has a folder of annotations; its subject is the person, ``H2``."""
-        found = [path for path in Path(root).glob(f"{ANNOTATIONS}/{CLIP}") if path.is_dir()]
-        names = ["/".join(path.parts[-7:]) for path in found]
+        """One key per recording that has a folder of annotations. The subject is the person, ``H2``."""
+        folders = [path for path in Path(root).glob(f"{ANNOTATIONS}/{CLIP}") if path.is_dir()]
+        names = ["/".join(path.parts[-7:]) for path in folders]
         return sorted(SequenceKey(self.name, name.split("/")[1], name) for name in names)
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
-        """Clips of one recording; events, frames and hand files that cannot be used, with their reasons."""
+        """Clips of one recording, and reasons for unusable events, frames and hand files."""
         category = _category(key)
         camera = camera_poses(raw.read(path := f"{ANNOTATIONS}/{key.name}/3Dseg/output.log"), path)
-        thing = self._object(raw, key, category, camera)
+        object_motion = self._object(raw, key, category, camera)
         tracks, results = _hands(raw, key, camera, hands)
-        wanted, unknown = self._wanted(raw, key, len(camera))
-        eyes = CameraTrack(
-            key.name.partition("/")[0],
-            twice_rotvecs(rotmat_to_rotvec(camera[:, :3, :3])).astype(np.float32),
-            twice_values(camera[:, :3, 3]).astype(np.float32),
-            twice_frames(len(camera)).astype(np.int32),
+        ranges, unknown_events = self._clip_ranges(raw, key, len(camera))
+        camera_track = CameraTrack(
+            name=key.name.partition("/")[0],
+            rotvec=upsample_rotvecs(rotmat_to_rotvec(camera[:, :3, :3])).astype(np.float32),
+            position_m=upsample_values(camera[:, :3, 3]).astype(np.float32),
+            images=upsample_frames(len(camera)).astype(np.int32),
         )
-        gravity, gravity_note = _gravity(thing, tracks, camera, hands)
+        gravity, gravity_note = _gravity(object_motion, tracks, camera, hands)
         whole = Clip(
             clip_id=str(key),
             dataset=self.name,
             subject=key.subject,
             sequence=key.name,
             hands=tracks,
-            object=thing.track,
-            source_frames=numbered(eyes.images, thing.recorded),
+            object=object_motion.track,
+            source_frames=mark_interpolated(camera_track.images, object_motion.recorded),
             gravity=gravity,
-            gravity_note=f"{gravity_note}; {thing.note}",
+            gravity_note=f"{gravity_note}; {object_motion.note}",
             verb=None,
             object_words=category.words,
             sources=raw.sources,
             source_fps=self.source_fps,
-            camera=eyes,
+            camera=camera_track,
         )
-        return [*results, *thing.left_out, *unknown, *self._cut(whole, eyes.images, wanted, thing)]
+        clips = self._cut(whole, camera_track.images, ranges, object_motion)
+        return [*results, *object_motion.rejected_frames, *unknown_events, *clips]
 
     def _cut(
-        self, whole: Clip, numbers: np.ndarray, wanted: list[_Wanted], thing: _Object
+        self, whole: Clip, source_frames: np.ndarray, ranges: list[_ClipRange], object_motion: _ObjectMotion
     ) -> Iterator[Clip | Quarantined]:
-        """The stretches of each wanted range in which the object has a pose. numbers: (frame,) frames of the source."""
-        for item in wanted:
+        """One clip per interval of each range in which the object has a pose. source_frames: (frame,) in the source."""
+        for item in ranges:
             start, stop = max(0, 2 * item.start - self.margin_frames), 2 * item.stop - 1 + self.margin_frames
-            inside, where = slice(start, stop), f"{ANNOTATIONS}/{whole.sequence}/objpose"
-            found = [(start + a, start + b) for a, b in runs(has_pose(thing.tracked)[inside])]
-            pieces = [trimmed(piece, thing.recorded) for piece in found]
+            inside, location = slice(start, stop), f"{ANNOTATIONS}/{whole.sequence}/objpose"
+            with_pose = [(start + a, start + b) for a, b in runs(has_pose(object_motion.tracked)[inside])]
+            pieces = [trim_to_recorded(piece, object_motion.recorded) for piece in with_pose]
             yield from missing_poses(
-                f"{item.clip_id}/missing", where, "the object", numbers[inside], thing.tracked[inside]
+                f"{item.clip_id}/missing", location, "the object", source_frames[inside], object_motion.tracked[inside]
             )
-            long = [piece for piece in pieces if piece[1] - piece[0] >= self.shortest_frames]
-            if not long:
+            accepted = [piece for piece in pieces if piece[1] - piece[0] >= self.shortest_frames]
+            if not accepted:
                 got = f"{max((b - a for a, b in pieces), default=0)} in frames {item.start} to {item.stop - 1}"
                 expected = f"{self.shortest_frames} frames (at 30 per second) with the object"
-                yield Quarantined(item.clip_id, whole.clip_id, expected, got, "nothing to do, or lower shortest_frames")
-            for a, b in long:
+                remedy = "nothing to do, or lower shortest_frames"
+                yield Quarantined(item.clip_id, where=whole.clip_id, expected=expected, got=got, remedy=remedy)
+            for a, b in accepted:
                 frames = (int(whole.source_frames[a]), int(whole.source_frames[b - 1]) + 1)
-                name = item.clip_id if len(long) == 1 else f"{whole.clip_id}/{frames[0]:04d}-{frames[1]:04d}"
+                name = item.clip_id if len(accepted) == 1 else f"{whole.clip_id}/{frames[0]:04d}-{frames[1]:04d}"
                 yield replace(whole.take(slice(a, b)), clip_id=name, verb=item.verb, labelled_hand=item.hand)
 
-    def _wanted(self, raw: RawTree, key: SequenceKey, n_frames: int) -> tuple[list[_Wanted], list[Quarantined]]:
-        """Ranges that are to be clips, and events whose word nobody knows."""
+    def _clip_ranges(self, raw: RawTree, key: SequenceKey, n_frames: int) -> tuple[list[_ClipRange], list[Quarantined]]:
+        """Ranges that become clips, and reasons for events with an unknown word."""
         if self.clips == "whole":
             _, _, category, *_, task = key.name.split("/")
-            return [_Wanted(str(key), 0, n_frames, TASKS.get((category, task)), None)], []
+            verb = TASKS.get((category, task))
+            return [_ClipRange(str(key), start=0, stop=n_frames, verb=verb, hand=None)], []
         path = f"{ANNOTATIONS}/{key.name}/action/color.json"
         if not raw.has(path) and path not in (raw.manifest or ()):
             remedy = "unpack HOI4D_annotations.zip here, or set clips: whole, which needs no events"
             raise BadInput(path, "a file with the events of the recording", "nothing there", remedy)
-        wanted, unknown = dict[tuple[int, int], _Wanted](), list[Quarantined]()
+        ranges, unknown_events = dict[tuple[int, int], _ClipRange](), list[Quarantined]()
         for event in action_events(raw.read(path), path):
             start, stop = event.start, min(event.stop, n_frames)
             word, clip_id = event.word.lower(), f"{key}/{start:04d}-{stop:04d}"
             if word not in EVENTS:
                 expected = f"one of {', '.join(EVENTS)}"
-                unknown.append(Quarantined(clip_id, path, expected, repr(event.word)[:40], "nothing to do"))
+                got = repr(event.word)[:40]
+                unknown_events.append(
+                    Quarantined(clip_id, where=path, expected=expected, got=got, remedy="nothing to do")
+                )
             elif (action := EVENTS[word]) is not None and stop > start:
-                wanted[start, stop] = _Wanted(clip_id, start, stop, *action)
-        return list(wanted.values()), unknown
+                verb, hand = action
+                ranges[start, stop] = _ClipRange(clip_id, start=start, stop=stop, verb=verb, hand=hand)
+        return list(ranges.values()), unknown_events
 
-    def _object(self, raw: RawTree, key: SequenceKey, category: Category, camera: np.ndarray) -> _Object:
+    def _object(self, raw: RawTree, key: SequenceKey, category: Category, camera: np.ndarray) -> _ObjectMotion:
         folder = f"{ANNOTATIONS}/{key.name}/objpose"
         numbers = frame_numbers(folder, raw.names(folder, ".json"))
         if not numbers or max(numbers) >= len(camera):
@@ -221,12 +231,16 @@ class Hoi4dAdapter(Described):
         contents = _read_frames(raw, folder, names)
         poses = [object_poses(data, f"{folder}/{name}") for name, data in zip(names, contents, strict=True)]
         labels = [pose.label for pose in poses[0]]
-        for name, own in zip(names, poses, strict=True):
-            if [pose.label for pose in own] != labels:
-                raise BadInput(f"{folder}/{name}", f"the parts {', '.join(labels)}", ", ".join(p.label for p in own))
+        for name, frame_poses in zip(names, poses, strict=True):
+            if [pose.label for pose in frame_poses] != labels:
+                got = ", ".join(pose.label for pose in frame_poses)
+                raise BadInput(f"{folder}/{name}", f"the parts {', '.join(labels)}", got)
         tracked = np.zeros(len(camera), bool)
         tracked[frames] = True
-        boxes = [camera[frames] @ _transforms([own[number] for own in poses]) for number in range(len(labels))]
+        boxes = [
+            camera[frames] @ _transforms([frame_poses[number] for frame_poses in poses])
+            for number in range(len(labels))
+        ]
         extents = np.array([pose.extents_m for pose in poses[0]])
         build = self._hinged if category.hinged else _rigid
         return build(raw, key, category, extents, boxes, tracked)
@@ -239,21 +253,30 @@ class Hoi4dAdapter(Described):
         extents_m: np.ndarray,
         boxes: list[np.ndarray],
         tracked: np.ndarray,
-    ) -> _Object:
-        where = f"{ANNOTATIONS}/{key.name}/objpose"
+    ) -> _ObjectMotion:
+        location = f"{ANNOTATIONS}/{key.name}/objpose"
         model, names, whole_from = _hinged_model(raw, category, _instance(key))
         corners = [model.vertices_m[model.part == part] for part in (0, 1)]
-        aligned = [own @ turn[:3, :3].T + turn[:3, 3] for own, turn in zip(corners, whole_from, strict=True)]
-        chosen, ratio = matched(where, extents_m, names, np.array([np.ptp(own, axis=0) for own in aligned]))
-        seen = [boxes[box] @ turn for box, turn in zip(chosen, whole_from, strict=True)]
+        aligned = [
+            vertices @ aligned_from_whole[:3, :3].T + aligned_from_whole[:3, 3]
+            for vertices, aligned_from_whole in zip(corners, whole_from, strict=True)
+        ]
+        chosen, ratio = match_boxes(
+            location, extents_m, names, np.array([np.ptp(vertices, axis=0) for vertices in aligned])
+        )
+        world_from_whole = [
+            boxes[box] @ aligned_from_whole for box, aligned_from_whole in zip(chosen, whole_from, strict=True)
+        ]
         assert model.hinge is not None
-        fit = fit_hinge(seen[0], seen[1], model.hinge, (box_corners(corners[0]), box_corners(corners[1])))
-        frames, off = np.flatnonzero(tracked), fit.off(self.most_off_mm, self.most_off_deg)
+        fit = fit_hinge(
+            world_from_whole[0], world_from_whole[1], model.hinge, (box_corners(corners[0]), box_corners(corners[1]))
+        )
+        frames, off = np.flatnonzero(tracked), fit.exceeds(self.most_off_mm, self.most_off_deg)
         tracked[frames[off]] = False
         limits = (self.most_off_mm, self.most_off_deg)
-        left_out = [fit.left_out(f"{key}/hinge", where, frames, *limits)] if off.any() else []
+        rejected = [fit.rejected_frames_reason(f"{key}/hinge", location, frames, *limits)] if off.any() else []
         note = f"{fit.note}; {_box_note(ratio, aligned)}"
-        return _placed(model, fit.world_from_object, fit.hinge_rad, frames, tracked, note, left_out)
+        return _object_motion(model, fit.world_from_object, fit.hinge_rad, frames, tracked, note, rejected)
 
 
 def _category(key: SequenceKey) -> Category:
@@ -271,11 +294,11 @@ def _instance(key: SequenceKey) -> str:
 
 
 def _transforms(poses: list[PartPose]) -> np.ndarray:
-    """(frame, 4, 4) camera from the part's own mesh."""
-    found = np.tile(np.eye(4), (len(poses), 1, 1))
-    found[:, :3, :3] = [pose.rotation for pose in poses]
-    found[:, :3, 3] = [pose.centre_m for pose in poses]
-    return found
+    """(frame, 4, 4) camera from the part's mesh."""
+    transforms = np.tile(np.eye(4), (len(poses), 1, 1))
+    transforms[:, :3, :3] = [pose.rotation for pose in poses]
+    transforms[:, :3, 3] = [pose.centre_m for pose in poses]
+    return transforms
 
 
 def _rigid(
@@ -285,75 +308,86 @@ def _rigid(
     extents_m: np.ndarray,
     boxes: list[np.ndarray],
     tracked: np.ndarray,
-) -> _Object:
+) -> _ObjectMotion:
     number = _instance(key)
     mesh = raw_mesh(raw, f"{MODELS}/rigid/{category.folder}/{number}.obj")
     name = f"{category.folder.lower()}_{number}"
-    (chosen,), ratio = matched(
+    (chosen,), ratio = match_boxes(
         f"{ANNOTATIONS}/{key.name}/objpose", extents_m, [name], np.ptp(mesh.vertices, axis=0)[None]
     )
     model = ObjectModel(name, mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), np.uint8))
     note = _box_note(ratio, [mesh.vertices])
-    return _placed(model, boxes[chosen], None, np.flatnonzero(tracked), tracked, note, [])
+    return _object_motion(model, boxes[chosen], None, np.flatnonzero(tracked), tracked, note, [])
 
 
 def _hinged_model(raw: RawTree, category: Category, number: str) -> tuple[ObjectModel, list[str], list[np.ndarray]]:
-    """The whole object at rest; the names of its two meshes, base first; each one's own frame from the whole (4, 4)."""
+    """Whole object at rest, names of its two meshes (base first), and (4, 4) mesh frame from whole for each."""
     folder = f"{MODELS}/articulated/{category.folder}/{number}"
     mobility, tree = f"{folder}/mobility_v2.json", f"{folder}/result.json"
     joint = hinge_joint(raw.read(mobility), raw.read(tree), mobility, tree)
     names = [joint.base, joint.moving]
     meshes = [raw_mesh(raw, f"{folder}/objs/{name}.obj") for name in names]
     paths = [f"{folder}/objs/{name}-align.obj" for name in names]
-    own = [raw_mesh(raw, path).vertices for path in paths]
-    turns = [aligned_from_whole(*item) for item in zip(paths, own, [mesh.vertices for mesh in meshes], strict=True)]
+    aligned_vertices = [raw_mesh(raw, path).vertices for path in paths]
+    whole_vertices = [mesh.vertices for mesh in meshes]
+    transforms = [aligned_from_whole(*item) for item in zip(paths, aligned_vertices, whole_vertices, strict=True)]
     faces = [mesh.faces for mesh in meshes]
-    vertices, hinge = [mesh.vertices for mesh in meshes], Hinge(joint.axis, joint.origin_m)
-    model = hinged_model(f"{category.folder.lower()}_{number}", vertices, faces, hinge)
-    return model, names, turns
+    hinge = Hinge(joint.axis, joint.origin_m)
+    model = hinged_model(f"{category.folder.lower()}_{number}", whole_vertices, faces, hinge)
+    return model, names, transforms
 
 
 def _box_note(ratio: np.ndarray, aligned_m: list[np.ndarray]) -> str:
-    """How annotated boxes compare with the meshes, which are not resized."""
-    off = max(float(np.linalg.norm((own.min(axis=0) + own.max(axis=0)) / 2)) for own in aligned_m)
-    return f"boxes {ratio.min():.2f} to {ratio.max():.2f} of the mesh, whose middle is {1000 * off:.1f} mm off"
+    """Compare annotated boxes with the meshes, in words. Meshes are not resized."""
+    centre_offset_m = max(
+        float(np.linalg.norm((vertices.min(axis=0) + vertices.max(axis=0)) / 2)) for vertices in aligned_m
+    )
+    return (
+        f"boxes {ratio.min():.2f} to {ratio.max():.2f} of the mesh, whose middle is {1000 * centre_offset_m:.1f} mm off"
+    )
 
 
-def _placed(
+def _object_motion(
     model: ObjectModel,
     world_from_object: np.ndarray,
     hinge_rad: np.ndarray | None,
     frames: np.ndarray,
     tracked: np.ndarray,
     note: str,
-    left_out: list[Quarantined],
-) -> _Object:
-    """Poses of some source frames as a track at 30 fps; frames without a pose repeat the one before."""
+    rejected_frames: list[Quarantined],
+) -> _ObjectMotion:
+    """Convert poses of source frames to a track at 30 fps. Frames without a pose repeat the previous one."""
     source = np.clip(np.searchsorted(frames, np.arange(len(tracked)), side="right") - 1, 0, None)
-    rotvec, place = rotmat_to_rotvec(world_from_object[:, :3, :3])[source], world_from_object[source, :3, 3]
-    angle = None if hinge_rad is None else twice_values(hinge_rad[source], tracked).astype(np.float32)
+    rotvec, position = rotmat_to_rotvec(world_from_object[:, :3, :3])[source], world_from_object[source, :3, 3]
+    angle = None if hinge_rad is None else upsample_values(hinge_rad[source], tracked).astype(np.float32)
     track = ObjectTrack(
         model,
-        twice_rotvecs(rotvec).astype(np.float32),
-        twice_values(place, tracked).astype(np.float32),
-        angle,
+        rotvec=upsample_rotvecs(rotvec).astype(np.float32),
+        translation_m=upsample_values(position, tracked).astype(np.float32),
+        hinge_rad=angle,
     )
-    both = np.zeros(track.n_frames, bool)
-    both[::2], both[1::2] = tracked, tracked[:-1] & tracked[1:]
+    has_pose_or_neighbours = np.zeros(track.n_frames, bool)
+    has_pose_or_neighbours[::2], has_pose_or_neighbours[1::2] = tracked, tracked[:-1] & tracked[1:]
     recorded = np.zeros(track.n_frames, bool)
     recorded[::2] = tracked
-    return _Object(bridge(track, both), both, recorded, note, left_out)
+    return _ObjectMotion(
+        track=bridge(track, has_pose_or_neighbours),
+        tracked=has_pose_or_neighbours,
+        recorded=recorded,
+        note=note,
+        rejected_frames=rejected_frames,
+    )
 
 
 def _hands(
     raw: RawTree, key: SequenceKey, camera: np.ndarray, hands: HandPair
 ) -> tuple[dict[Side, HandTrack], list[Clip | Quarantined]]:
-    """Both hands in the world at 30 fps, and the files that could not be used. Raises BadInput where none could."""
+    """Both hands in the world at 30 fps, and reasons for unusable files. Raises BadInput without a usable file."""
     tracks, faulty = dict[Side, HandTrack](), list[Clip | Quarantined]()
     change = FrameChange(camera[:, :3, :3], camera[:, :3, 3])
     for side in SIDES:
         source, problems = _source_hand(raw, key, side, len(camera))
-        tracks[side] = twice_hand(to_track(source, CONVENTION, hands[side], change))
+        tracks[side] = upsample_hand(to_track(source, CONVENTION, hands[side], change))
         faulty += problems
     if not any(track.valid.any() for track in tracks.values()):
         folders = " or ".join(folder.format("right") for folder in HAND_FOLDERS)
@@ -363,7 +397,7 @@ def _hands(
 
 
 def _read_frames(raw: RawTree, folder: str, names: list[str]) -> list[bytes]:
-    """The files of a folder in the order given, read in that of their names: the folder has one digest."""
+    """The files of a folder in the order of ``names``. Reads them sorted, which the folder's digest requires."""
     in_order = sorted(names)
     contents = dict(zip(in_order, raw.read_folder(folder, in_order) if names else [], strict=True))
     return [contents[name] for name in names]
@@ -371,7 +405,7 @@ def _read_frames(raw: RawTree, folder: str, names: list[str]) -> list[bytes]:
 
 def _source_hand(raw: RawTree, key: SequenceKey, side: Side, n_frames: int) -> tuple[SourceHand, list[Quarantined]]:
     folders = [f"{folder.format(side)}/{key.name}" for folder in HAND_FOLDERS]
-    folder = next((own for own in folders if raw.names(own, ".pickle")), folders[0])
+    folder = next((candidate for candidate in folders if raw.names(candidate, ".pickle")), folders[0])
     numbers = frame_numbers(folder, raw.names(folder, ".pickle"))
     pose, translation_m, betas = np.zeros((n_frames, 48)), np.zeros((n_frames, 3)), np.zeros((n_frames, 10))
     valid, faulty = np.zeros(n_frames, bool), []
@@ -381,23 +415,26 @@ def _source_hand(raw: RawTree, key: SequenceKey, side: Side, n_frames: int) -> t
     contents = _read_frames(raw, folder, [numbers[frame] for frame in frames])
     for frame, data in zip(frames, contents, strict=True):
         try:
-            found = hand_frame(data, f"{folder}/{numbers[frame]}")
+            hand = hand_frame(data, f"{folder}/{numbers[frame]}")
         except ShortPose as problem:
             faulty.append(Quarantined.from_error(f"{key}/{side}-{frame:05d}", problem))
             continue
-        pose[frame], betas[frame], translation_m[frame], valid[frame] = *found[:2], found.translation_m, True
+        pose[frame], betas[frame], translation_m[frame], valid[frame] = *hand[:2], hand.translation_m, True
     betas[~valid] = betas[valid][0] if valid.any() else 0
-    return SourceHand(translation_m, pose[:, :3], pose[:, 3:], betas, valid), faulty
+    source = SourceHand(
+        translation_m=translation_m, global_orient=pose[:, :3], fingers=pose[:, 3:], betas=betas, valid=valid
+    )
+    return source, faulty
 
 
 def _gravity(
-    thing: _Object, tracks: dict[Side, HandTrack], camera: np.ndarray, hands: HandPair
+    object_motion: _ObjectMotion, tracks: dict[Side, HandTrack], camera: np.ndarray, hands: HandPair
 ) -> tuple[np.ndarray | None, str]:
-    """Estimated from the base of the object where it rests; nothing in the source says which way is down."""
-    track = thing.track
+    """Estimate gravity from the base of the object at rest, because the source does not state it."""
+    track = object_motion.track
     joints = [np.where(t.valid[:, None, None], track_joints(t, hands[side]), np.nan) for side, t in tracks.items()]
     poses = np.tile(np.eye(4), (track.n_frames, 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = track.world_from_object.rotation, track.translation_m
-    turned = np.repeat(camera[:, :3, :3], 2, axis=0)[: track.n_frames]
-    base = TrackedObject(footing(track.model.vertices_m, track.model.faces_of(0)), thing.tracked, poses)
-    return estimate_gravity([base], np.concatenate(joints, axis=1).astype(np.float64), turned)
+    camera_rotation = np.repeat(camera[:, :3, :3], 2, axis=0)[: track.n_frames]
+    base = TrackedObject(footing(track.model.vertices_m, track.model.faces_of(0)), object_motion.tracked, poses)
+    return estimate_gravity([base], np.concatenate(joints, axis=1).astype(np.float64), camera_rotation)

@@ -1,8 +1,8 @@
 """ManipNet (Zhang et al. 2021): motion capture of two hands and one object, in left-handed decimetres at 120 Hz.
 
-The hands are 17-joint skeletons, not MANO: a MANO-layout hand is fitted to their joints and finger tips, with one shape
-per recording. There are no action labels: the words come from the object's file name and from what it does.
-To go right-handed, the world and every joint frame are seen in a mirror with normal x; meshes already are right-handed.
+The hands are 17-joint skeletons: a MANO-layout hand is fitted to their joints and fingertips, with one shape per
+recording. There are no action labels: the noun comes from the object's file name and the verb from its motion.
+Negating x of the world and of every joint frame makes the motion right-handed. Meshes already are right-handed.
 """
 
 import json
@@ -14,8 +14,8 @@ import numpy as np
 from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, hand_track
 from hoidata.clips.recording import HandRecording, OwnHandTrack
-from hoidata.dataset_folders import facts_beside
-from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
+from hoidata.dataset_folders import facts_of_adapter
+from hoidata.datasets.base import AdapterBase, DatasetPart, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.manipnet.hand import (
     HAND_REFERENCE,
     HAND_SKIN,
@@ -58,7 +58,7 @@ HAND_JOINTS = (
     *THUMB_CHAIN,
     *(f"{finger}_{joint}" for finger in ("INDEX", "MIDDLE", "RING", "PINKY") for joint in ("MCP", "PIP_FE", "DIP_FE")),
 )
-# The source joint behind each of MANO's 16; THUMB_CMC_FE has no counterpart.
+# Source joint of each of MANO's 16 joints; THUMB_CMC_FE has no counterpart.
 MANO_JOINTS = (
     "WRIST",
     *(f"{finger}_{joint}" for finger in FINGERS for joint in ("MCP", "PIP_FE", "DIP_FE")),
@@ -84,23 +84,19 @@ PARTS = (
 
 @dataclass(frozen=True)
 class Recording:
-    """One two-hand sequence at 30 fps in the right-handed world, metres.
-
-    source_frames: (frame,) index in the files. keypoints_m: per side (frame, 21, 3) in hoidata's joint order.
-    rotation: (frame, 3, 3) and translation_m: (frame, 3) of the object. cuts: unusable stretches, in source frames.
-    """
+    """One two-hand sequence at 30 fps in the right-handed world, metres."""
 
     source_fps: float
-    source_frames: np.ndarray
-    keypoints_m: dict[Side, np.ndarray]
+    source_frames: np.ndarray  # (frame,) index in the files
+    keypoints_m: dict[Side, np.ndarray]  # (frame, 21, 3) in hoidata's joint order
     model: ObjectModel
-    rotation: np.ndarray
-    translation_m: np.ndarray
-    cuts: list[Cut]
-    paths: tuple[str, ...]
+    rotation: np.ndarray  # (frame, 3, 3) of the object
+    translation_m: np.ndarray  # (frame, 3) of the object
+    cuts: list[Cut]  # unusable intervals, in source frames
+    paths: tuple[str, ...]  # source files
 
     def usable(self) -> np.ndarray:
-        """(frame,) bool: not inside a cut."""
+        """(frame,) bool: the frame is outside of all cuts."""
         good = np.ones(len(self.source_frames), dtype=bool)
         for cut in self.cuts:
             good &= (self.source_frames < cut.start) | (self.source_frames >= cut.stop)
@@ -112,7 +108,7 @@ class Recording:
         return height_above_table(heights.min(axis=0))
 
     def centre_m(self) -> np.ndarray:
-        """(frame, 3) mean vertex of the object: its origin can lie 10 cm away from the mesh."""
+        """(frame, 3) mean vertex of the object, because its origin can be 10 cm away from the mesh."""
         return self.rotation @ self.model.vertices_m.mean(axis=0) + self.translation_m
 
     def distances_m(self) -> dict[Side, np.ndarray]:
@@ -132,62 +128,61 @@ def surface_distances(
 
 
 @dataclass(frozen=True)
-class ManipNetAdapter(Described):
+class ManipNetAdapter(AdapterBase):
     """Raw root: ``sequences/<name>/*.bvh.gz``, ``objects/<group>/<object>.obj.gz``, ``hand/hand_reference.json``.
 
-    margin_frames: frames (of 30 fps) kept before and after each interaction, as far as the tracking is usable; ids and
-    verbs are those of the interaction itself. Sequences without hand files are refused with that reason.
-    The shape of the hands is fitted to 100 frames of the recording itself: all are of one subject, but no clip may
-    depend on which other recordings are there.
+    Sequences without hand files are quarantined. The hand shape is fitted to 100 frames of each recording. All
+    recordings are of one subject, but a clip must not depend on other recordings.
     """
 
-    facts = facts_beside(__file__)
+    facts = facts_of_adapter(__file__)
+    # At 30 fps: usable frames kept before and after each interaction. Ids and verbs describe the interaction alone.
     margin_frames: int = 0
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
     parts: tuple[DatasetPart, ...] = PARTS
 
     def sequences(self, root: Path) -> list[SequenceKey]:
-        """One key per folder below ``sequences``; all recordings are of one subject."""
+        """One key per folder below ``sequences``. All recordings are of one subject."""
         folders = sorted(path for path in (Path(root) / "sequences").glob("*") if path.is_dir())
         return [SequenceKey(self.name, self.name, folder.name) for folder in folders]
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
-        """Clips of interaction of one sequence, and the stretches left out with their reasons."""
+        """One clip per interaction of one sequence, and reasons for rejected intervals."""
         recording = read_recording(raw, key.name)
         betas = fit_shape(recording.keypoints_m, hands)
-        results: list[Clip | Quarantined] = [_left_out(key, *cut) for cut in recording.cuts]
+        results: list[Clip | Quarantined] = [_rejected(key, *cut) for cut in recording.cuts]
         lift_m, centre_m, usable = recording.lift_m(), recording.centre_m(), recording.usable()
         nearest = np.minimum(*(distance.min(axis=1) for distance in recording.distances_m().values()))
-        for stretch in interactions(usable, nearest < TOUCH_M, lift_m > LIFTED_M):
-            frames = slice(*stretch)
-            start, stop = (int(recording.source_frames[i]) for i in (stretch.start, stretch.stop - 1))
+        for interval in interactions(usable, nearest < TOUCH_M, lift_m > LIFTED_M):
+            frames = slice(*interval)
+            start, stop = (int(recording.source_frames[i]) for i in (interval.start, interval.stop - 1))
             verb = motion_verb(lift_m[frames], centre_m[frames], recording.rotation[frames])
-            length = stretch.stop - stretch.start
+            length = interval.stop - interval.start
             if length < SHORTEST_FRAMES:
-                ends = [frame for frame in (stretch.start - 1, stretch.stop) if 0 <= frame < len(usable)]
+                ends = [frame for frame in (interval.start - 1, interval.stop) if 0 <= frame < len(usable)]
                 got = f"{length}" if usable[ends].all() else f"{length}, next to frames that are left out"
-                results.append(_left_out(key, start, stop + 1, f"{SHORTEST_FRAMES} frames or more", got))
+                results.append(_rejected(key, start, stop + 1, f"{SHORTEST_FRAMES} frames or more", got))
             elif verb is None:
-                results.append(_left_out(key, start, stop + 1, "an object that moves", "one that stays on the table"))
+                results.append(_rejected(key, start, stop + 1, "an object that moves", "one that stays on the table"))
             else:
-                kept = widened(stretch, self.margin_frames, usable)
+                frames_with_margin = widened(interval, self.margin_frames, usable)
                 sources = raw.recorded(*recording.paths)
-                clip = self._clip(key, recording, kept, betas, hands)
+                clip = self._clip(key, recording, frames_with_margin, betas, hands)
                 results.append(replace(clip, clip_id=_clip_id(key, start, stop), verb=verb, sources=sources))
         return results
 
     def recordings(self, raw: RawTree, key: SequenceKey) -> list[HandRecording]:
-        """All frames with the 17-joint hands of the files; none where the skin's file is missing or not listed."""
+        """All frames with the 17-joint hands of the files; empty if the skin's file is missing or not listed."""
         if not raw.has(HAND_SKIN) or (raw.manifest is not None and HAND_SKIN not in raw.manifest):
             return []
         return [read_hand_recording(raw, key)]
 
     def _clip(
-        self, key: SequenceKey, recording: Recording, stretch: Interval, betas: np.ndarray, hands: HandPair
+        self, key: SequenceKey, recording: Recording, interval: Interval, betas: np.ndarray, hands: HandPair
     ) -> Clip:
-        """The frames of a stretch as a clip; its id, verb and sources are the caller's to say."""
-        frames = slice(*stretch)
+        """The frames of an interval as a clip. The caller replaces id, verb and sources."""
+        frames = slice(*interval)
         fits = fit_hands({side: points[frames] for side, points in recording.keypoints_m.items()}, hands, betas)
         return Clip(
             clip_id=str(key),
@@ -226,47 +221,47 @@ def read_recording(raw: RawTree, name: str) -> Recording:
         if motion.names != HAND_JOINTS:
             expected = f"the {len(HAND_JOINTS)} joints WRIST to PINKY_DIP_FE"
             raise BadInput(hand_paths[side], expected, f"{len(motion.names)} joints")
-    left, thing = motions["left"], _read_motion(raw, object_path)
-    for path, motion in ((hand_paths["right"], motions["right"]), (object_path, thing)):
+    left, object_motion = motions["left"], _read_motion(raw, object_path)
+    for path, motion in ((hand_paths["right"], motions["right"]), (object_path, object_motion)):
         if (motion.n_frames, motion.frame_time_s) != (left.n_frames, left.frame_time_s):
             expected = f"{left.n_frames} frames of {left.frame_time_s} s as in the left hand's file"
             raise BadInput(path, expected, f"{motion.n_frames} frames of {motion.frame_time_s} s")
-    frames = thirty_fps_frames(thing.n_frames, thing.frame_time_s)
+    frames = thirty_fps_frames(object_motion.n_frames, object_motion.frame_time_s)
     tips = _read_tips(raw)
-    positions, rotations = thing.at(frames).world_joints()
+    positions, rotations = object_motion.at(frames).world_joints()
     return Recording(
-        source_fps=round(1 / thing.frame_time_s, 3),
+        source_fps=round(1 / object_motion.frame_time_s, 3),
         source_frames=frames,
         keypoints_m={side: keypoints_m(motions[side].at(frames), side, tips) for side in SIDES},
         model=model,
         rotation=rotations[:, 0],
         translation_m=positions[:, 0] * METRES_PER_UNIT,
         cuts=find_cuts(
-            _body("left hand", motions["left"]), _body("right hand", motions["right"]), _body("object", thing)
+            _body("left hand", motions["left"]), _body("right hand", motions["right"]), _body("object", object_motion)
         ),
         paths=(*hand_paths.values(), object_path, mesh_path, HAND_REFERENCE),
     )
 
 
 def read_hand_recording(raw: RawTree, key: SequenceKey) -> HandRecording:
-    """One sequence with every frame of the files and their own hands. Raises BadInput as ``read_recording`` does."""
+    """Read one sequence with every frame of the files and their 17-joint hands. Raises BadInput."""
     recording = read_recording(raw, key.name)
-    left, right, thing = (_read_motion(raw, path) for path in recording.paths[:3])
-    usable = np.ones(thing.n_frames, dtype=bool)
+    left, right, object_motion = (_read_motion(raw, path) for path in recording.paths[:3])
+    usable = np.ones(object_motion.n_frames, dtype=bool)
     for cut in recording.cuts:
         usable[cut.start : cut.stop] = False
-    world = _body("object", thing)
+    object_body = _body("object", object_motion)
     return HandRecording(
         dataset=key.dataset,
         subject=key.subject,
         sequence=key.name,
         fps=recording.source_fps,
         hand=read_hand(raw, right),
-        hands={"left": _own_hand(left), "right": _own_hand(right)},
+        hands={"left": _hand_track(left), "right": _hand_track(right)},
         object=ObjectTrack(
             recording.model,
-            rotmat_to_rotvec(world.rotation).astype(np.float32),
-            world.position_m.astype(np.float32),
+            rotmat_to_rotvec(object_body.rotation).astype(np.float32),
+            object_body.position_m.astype(np.float32),
         ),
         usable=usable,
         gravity=GRAVITY,
@@ -274,16 +269,22 @@ def read_hand_recording(raw: RawTree, key: SequenceKey) -> HandRecording:
     )
 
 
-def _own_hand(motion: BvhMotion) -> OwnHandTrack:
+def _hand_track(motion: BvhMotion) -> OwnHandTrack:
     wrist_m = (motion.root_position + motion.offsets[0]) * METRES_PER_UNIT
     rotvec = rotmat_to_rotvec(angles_yxz_to_rotmat(motion.angles_yxz_rad))
     return OwnHandTrack(wrist_m.astype(np.float32), rotvec.astype(np.float32))
 
 
 def keypoints_m(motion: BvhMotion, side: Side, tips: dict[str, np.ndarray]) -> np.ndarray:
-    """(frame, 21, 3) world keypoints in hoidata's order of a hand motion already seen in the mirror, metres.
+    """World keypoints of a hand in hoidata's order.
 
-    tips: per joint the finger tip in that joint's frame, right hand, right-handed axes, source units.
+    Args:
+        motion: of the hand, right-handed.
+        side: of the hand.
+        tips: fingertip by joint in the joint's frame, of the right hand, right-handed, source units.
+
+    Returns:
+        (frame, 21, 3) metres.
     """
     positions, rotations = motion.world_joints()
     index = {joint: i for i, joint in enumerate(motion.names)}
@@ -295,7 +296,7 @@ def keypoints_m(motion: BvhMotion, side: Side, tips: dict[str, np.ndarray]) -> n
 
 
 def thirty_fps_frames(n_frames: int, frame_time_s: float) -> np.ndarray:
-    """The source frame nearest to each 1/30 s, from frame 0 on: every 4th frame of a 120 Hz file."""
+    """The source frame closest to each multiple of 1/30 s: every 4th frame of a 120 Hz file."""
     count = int(np.floor((n_frames - 1) * frame_time_s * FPS + 1e-3)) + 1
     frames = np.rint(np.arange(count) / (FPS * frame_time_s)).astype(int)
     return frames[frames < n_frames]
@@ -310,12 +311,12 @@ def _object_path(raw: RawTree, folder: str) -> str:
 
 def _read_model(raw: RawTree, object_path: str) -> tuple[str, ObjectModel]:
     name = Path(object_path).name.removesuffix(".bvh.gz")
-    found = [f"{folder}/{name}.obj.gz" for folder in MESH_FOLDERS if raw.has(f"{folder}/{name}.obj.gz")]
-    if not found:
+    mesh_paths = [f"{folder}/{name}.obj.gz" for folder in MESH_FOLDERS if raw.has(f"{folder}/{name}.obj.gz")]
+    if not mesh_paths:
         raise BadInput(f"objects/*/{name}.obj.gz", "the mesh of the recorded object", "nothing there")
-    mesh = parse_obj(unpack_text(raw.read(found[0]), found[0]), found[0])
+    mesh = parse_obj(unpack_text(raw.read(mesh_paths[0]), mesh_paths[0]), mesh_paths[0])
     vertices_m = mesh.vertices * METRES_PER_UNIT
-    return found[0], ObjectModel(name, vertices_m, mesh.faces, np.zeros(len(vertices_m), dtype=np.uint8))
+    return mesh_paths[0], ObjectModel(name, vertices_m, mesh.faces, np.zeros(len(vertices_m), dtype=np.uint8))
 
 
 def _read_motion(raw: RawTree, path: str) -> BvhMotion:
@@ -323,7 +324,7 @@ def _read_motion(raw: RawTree, path: str) -> BvhMotion:
 
 
 def _read_tips(raw: RawTree) -> dict[str, np.ndarray]:
-    """Finger tips of the right hand in the frames of the last joints, right-handed axes, source units."""
+    """Fingertips of the right hand by last joint of the finger, in the joint's frame, right-handed, source units."""
     try:
         capsules = json.loads(raw.read(HAND_REFERENCE, LARGEST_REFERENCE))["capsules"]
         ends = {capsule["joint"]: np.array(capsule["end_local"], dtype=np.float64) for capsule in capsules}
@@ -337,7 +338,7 @@ def _read_tips(raw: RawTree) -> dict[str, np.ndarray]:
 
 
 def _body(name: str, motion: BvhMotion) -> BodyMotion:
-    """The root of a motion, and all its numbers."""
+    """Position and rotation of a motion's root, with all numbers of the file."""
     root = replace(
         motion, names=motion.names[:1], parents=motion.parents[:1], angles_yxz_rad=motion.angles_yxz_rad[:, :1]
     )
@@ -347,10 +348,11 @@ def _body(name: str, motion: BvhMotion) -> BodyMotion:
 
 
 def _clip_id(key: SequenceKey, start: int, last: int) -> str:
-    """From source frames, both included."""
+    """Clip id from source frames, both included."""
     return f"{key}/{start:06d}-{last:06d}"
 
 
-def _left_out(key: SequenceKey, start: int, stop: int, expected: str, got: str) -> Quarantined:
-    where = f"sequences/{key.name}, source frames {start} to {stop - 1}"
-    return Quarantined(_clip_id(key, start, stop - 1), where, expected, got, "nothing to do: they are left out")
+def _rejected(key: SequenceKey, start: int, stop: int, expected: str, got: str) -> Quarantined:
+    location = f"sequences/{key.name}, source frames {start} to {stop - 1}"
+    remedy = "nothing to do: they are left out"
+    return Quarantined(_clip_id(key, start, stop - 1), where=location, expected=expected, got=got, remedy=remedy)

@@ -1,10 +1,10 @@
-"""ManipNet's own hand: 17 joints, 19 capsules, and the skin its 104 proximity sensors sit on.
+"""ManipNet's hand: 17 joints, 19 capsules, and a skin with 104 proximity sensors. Also a strict reader of BVH files.
 
-The files hold the right hand in left-handed decimetres; here it is seen in the mirror, in metres. Its left hand is
-this one in a mirror again, exactly.
+The files have the right hand in left-handed decimetres. This module returns it right-handed in metres. The left hand is
+its exact mirror image.
 
-Its motion is in BVH files, read strictly: a text tree of joints that turn in the order Y, X, Z, followed by one line of
-numbers per frame. Angles come out in radians, everything else as written.
+A BVH file has a text tree of joints with rotation order Y, X, Z, followed by one line of numbers per frame. The reader
+returns angles in radians and everything else in the units of the file.
 """
 
 import gzip
@@ -31,19 +31,13 @@ MAX_FRAMES = 1_000_000
 
 @dataclass(frozen=True)
 class BvhMotion:
-    """A skeleton and its motion in the file's own unit and axes.
+    """A skeleton and its motion in the units and axes of the file."""
 
-    names: joints in file order, parents before children; end sites are no joints.
-    parents: (joint,) index of the parent, -1 for the root. offsets: (joint, 3) from the parent, in the parent's frame.
-    root_position: (frame, 3). angles_yxz_rad: (frame, joint, 3) angles about Y, X and Z;
-    the local rotation is ``Ry @ Rx @ Rz`` on column vectors.
-    """
-
-    names: tuple[str, ...]
-    parents: np.ndarray
-    offsets: np.ndarray
-    root_position: np.ndarray
-    angles_yxz_rad: np.ndarray
+    names: tuple[str, ...]  # joints in file order, parents before children, without end sites
+    parents: np.ndarray  # (joint,) index of the parent, -1 for the root
+    offsets: np.ndarray  # (joint, 3) from the parent, in the parent's frame
+    root_position: np.ndarray  # (frame, 3)
+    angles_yxz_rad: np.ndarray  # (frame, joint, 3) about Y, X and Z; rotation ``Ry @ Rx @ Rz`` on column vectors
     frame_time_s: float
 
     @property
@@ -51,18 +45,18 @@ class BvhMotion:
         return len(self.root_position)
 
     def at(self, frames: np.ndarray) -> "BvhMotion":
-        """The same skeleton at some frames only (index array or slice)."""
+        """The same skeleton at selected frames (index array or slice)."""
         return replace(self, root_position=self.root_position[frames], angles_yxz_rad=self.angles_yxz_rad[frames])
 
     def seen_in_mirror_x(self) -> "BvhMotion":
-        """The motion after negating the x axis of the world and of every joint; changes handedness."""
-        flip = np.array([-1.0, 1.0, 1.0])
-        turn = np.array([-1.0, 1.0, -1.0])
+        """The motion with x of the world and of every joint negated, which changes handedness."""
+        axis_signs = np.array([-1.0, 1.0, 1.0])
+        angle_signs = np.array([-1.0, 1.0, -1.0])
         return replace(
             self,
-            offsets=self.offsets * flip,
-            root_position=self.root_position * flip,
-            angles_yxz_rad=self.angles_yxz_rad * turn,
+            offsets=self.offsets * axis_signs,
+            root_position=self.root_position * axis_signs,
+            angles_yxz_rad=self.angles_yxz_rad * angle_signs,
         )
 
     def world_joints(self) -> tuple[np.ndarray, np.ndarray]:
@@ -80,12 +74,12 @@ class BvhMotion:
 def angles_yxz_to_rotmat(angles_yxz_rad: np.ndarray) -> np.ndarray:
     """Angles about Y, X, Z in radians (..., 3) to ``Ry @ Rx @ Rz`` (..., 3, 3), column vectors."""
     axes = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    turn_y, turn_x, turn_z = (rotvec_to_rotmat(angles_yxz_rad[..., i, None] * axes[i]) for i in range(3))
-    return turn_y @ turn_x @ turn_z
+    rotation_y, rotation_x, rotation_z = (rotvec_to_rotmat(angles_yxz_rad[..., i, None] * axes[i]) for i in range(3))
+    return rotation_y @ rotation_x @ rotation_z
 
 
-def parse_bvh(text: str, where: str) -> BvhMotion:
-    """Read the text of a BVH file; ``where`` names the file in errors.
+def parse_bvh(text: str, path: str) -> BvhMotion:
+    """Parse the text of a BVH file.
 
     Raises BadInput on anything that is not exactly this dialect: root channels X, Y, Z position and Y, X, Z rotation,
     other joints Y, X, Z rotation; as many frames and columns as announced; finite numbers only.
@@ -93,13 +87,13 @@ def parse_bvh(text: str, where: str) -> BvhMotion:
     lines = text.splitlines()
     motion_line = next((i for i, line in enumerate(lines) if line.strip() == "MOTION"), None)
     if motion_line is None:
-        raise BadInput(where, "a line MOTION after the hierarchy", f"none in {len(lines)} lines")
-    skeleton = _SkeletonReader("\n".join(lines[:motion_line]), where)
+        raise BadInput(path, "a line MOTION after the hierarchy", f"none in {len(lines)} lines")
+    skeleton = _SkeletonReader("\n".join(lines[:motion_line]), path)
     skeleton.read()
     names = skeleton.names
-    frames, frame_time_s = _parse_motion_head(lines[motion_line + 1 : motion_line + 3], where)
+    frames, frame_time_s = _parse_motion_head(lines[motion_line + 1 : motion_line + 3], path)
     rows = [line for line in lines[motion_line + 3 :] if line.strip()]
-    table = _parse_rows(rows, frames, 3 + 3 * len(names), where)
+    table = _parse_rows(rows, frames, 3 + 3 * len(names), path)
     return BvhMotion(
         names=tuple(names),
         parents=np.array(skeleton.parents),
@@ -110,26 +104,26 @@ def parse_bvh(text: str, where: str) -> BvhMotion:
     )
 
 
-def unpack_text(data: bytes, where: str, max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """Text of a gzip file's bytes, at most ``max_bytes`` once unpacked. Raises BadInput when it cannot be read."""
+def unpack_text(data: bytes, path: str, max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """Unpack gzipped text of at most ``max_bytes``. Raises BadInput if it is larger or unreadable."""
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as stream:
             unpacked = stream.read(max_bytes + 1)
         text = unpacked.decode("utf-8")
     except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
-        raise BadInput(where, "gzipped text", f"{type(error).__name__}: {error}") from error
+        raise BadInput(path, "gzipped text", f"{type(error).__name__}: {error}") from error
     if len(unpacked) > max_bytes:
-        raise BadInput(where, f"at most {max_bytes} bytes of text", "more", "check that it is the released file")
+        raise BadInput(path, f"at most {max_bytes} bytes of text", "more", "check that it is the released file")
     return text
 
 
 class _SkeletonReader:
-    """Recursive descent over the words before MOTION; joints come out in file order, end sites are checked and left."""
+    """Recursive descent parser of the words before MOTION. Checks end sites and drops them."""
 
-    def __init__(self, text: str, where: str) -> None:
+    def __init__(self, text: str, path: str) -> None:
         self.words = text.split()
-        self.place = 0
-        self.where = where
+        self.position = 0
+        self.path = path
         self.names: list[str] = []
         self.parents: list[int] = []
         self.offsets: list[list[float]] = []
@@ -137,8 +131,8 @@ class _SkeletonReader:
     def read(self) -> None:
         self.expect("HIERARCHY", "ROOT")
         self.read_joint(-1)
-        if self.place < len(self.words):
-            raise self.wrong("MOTION after the one root", self.words[self.place])
+        if self.position < len(self.words):
+            raise self.wrong("MOTION after the one root", self.words[self.position])
 
     def read_joint(self, parent: int) -> None:
         joint = len(self.names)
@@ -175,43 +169,43 @@ class _SkeletonReader:
                 raise self.wrong(f"{word} (in {' '.join(words)})", got)
 
     def take(self) -> str:
-        if self.place >= len(self.words):
+        if self.position >= len(self.words):
             raise self.wrong("more of the hierarchy", "its end")
-        self.place += 1
-        return self.words[self.place - 1]
+        self.position += 1
+        return self.words[self.position - 1]
 
     def wrong(self, expected: str, got: str) -> BadInput:
         after = f"after joint {self.names[-1][:40]}" if self.names else "at the start"
-        return BadInput(f"{self.where} {after}", expected, repr(got[:40]))
+        return BadInput(f"{self.path} {after}", expected, repr(got[:40]))
 
 
-def _parse_motion_head(lines: list[str], where: str) -> tuple[int, float]:
+def _parse_motion_head(lines: list[str], path: str) -> tuple[int, float]:
     words = " ".join(lines).split()
     try:
         if words[0] != "Frames:" or words[2:4] != ["Frame", "Time:"]:
             raise ValueError
         frames, frame_time_s = int(words[1]), float(words[4])
     except (ValueError, IndexError):
-        raise BadInput(where, "lines 'Frames: N' and 'Frame Time: seconds'", repr(" ".join(lines)[:80])) from None
+        raise BadInput(path, "lines 'Frames: N' and 'Frame Time: seconds'", repr(" ".join(lines)[:80])) from None
     if not 0 < frames <= MAX_FRAMES or not 1e-4 < frame_time_s < 1:
-        raise BadInput(where, f"1 to {MAX_FRAMES} frames of 0.0001 to 1 s", f"{frames} frames of {frame_time_s} s")
+        raise BadInput(path, f"1 to {MAX_FRAMES} frames of 0.0001 to 1 s", f"{frames} frames of {frame_time_s} s")
     return frames, frame_time_s
 
 
-def _parse_rows(rows: list[str], frames: int, columns: int, where: str) -> np.ndarray:
+def _parse_rows(rows: list[str], frames: int, columns: int, path: str) -> np.ndarray:
     if len(rows) != frames:
-        raise BadInput(where, f"{frames} motion lines as announced", f"{len(rows)}")
-    words = [row.split() for row in rows]
-    wrong = next((i for i, row in enumerate(words) if len(row) != columns), None)
+        raise BadInput(path, f"{frames} motion lines as announced", f"{len(rows)}")
+    words = [line.split() for line in rows]
+    wrong = next((i for i, numbers in enumerate(words) if len(numbers) != columns), None)
     if wrong is not None:
-        raise BadInput(where, f"{columns} columns", f"{len(words[wrong])} in frame {wrong}")
+        raise BadInput(path, f"{columns} columns", f"{len(words[wrong])} in frame {wrong}")
     try:
         table = np.array(words, dtype=np.float64)
     except ValueError as error:
-        raise BadInput(where, "numbers", str(error)) from error
+        raise BadInput(path, "numbers", str(error)) from error
     if not np.isfinite(table).all():
         frame, column = np.argwhere(~np.isfinite(table))[0]
-        raise BadInput(where, "finite numbers", f"{table[frame, column]} in frame {frame}, column {column}")
+        raise BadInput(path, "finite numbers", f"{table[frame, column]} in frame {frame}, column {column}")
     return table
 
 
@@ -241,7 +235,7 @@ _SHAPES = {
 
 
 def read_hand(raw: RawTree, skeleton: BvhMotion) -> TrackedHand:
-    """The right hand. skeleton: of a right hand's motion, already seen in the mirror. Raises BadInput."""
+    """Read the right hand. skeleton: motion of a right hand, right-handed. Raises BadInput."""
     capsules, sensors = _read_reference(raw, skeleton.names)
     skin = _read_skin(raw)
     joint_from_skin = _MIRROR @ _rigid(skin["bind_poses"]) @ _MIRROR
@@ -269,19 +263,22 @@ def read_hand(raw: RawTree, skeleton: BvhMotion) -> TrackedHand:
 
 
 def _read_reference(raw: RawTree, names: tuple[str, ...]) -> tuple[JointCapsules, np.ndarray]:
-    """The 19 capsules and the 104 vertices of the proximity sensors."""
+    """Read the 19 capsules and the 104 skin vertices of the proximity sensors."""
     try:
         reference = json.loads(raw.read(HAND_REFERENCE, LARGEST_REFERENCE))
-        rows = reference["capsules"]
-        joint = np.array([names.index(row["joint"]) for row in rows])
-        start, end = (np.array([row[key] for row in rows], dtype=np.float64) for key in ("start_local", "end_local"))
-        radius = np.array([row["radius"] for row in rows], dtype=np.float64)
+        capsule_entries = reference["capsules"]
+        joint = np.array([names.index(capsule["joint"]) for capsule in capsule_entries])
+        start, end = (
+            np.array([capsule[key] for capsule in capsule_entries], dtype=np.float64)
+            for key in ("start_local", "end_local")
+        )
+        radius = np.array([capsule["radius"] for capsule in capsule_entries], dtype=np.float64)
         sensors = np.array(reference["proximity_vertices"], dtype=np.int64)
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         expected = "capsules with joint, start_local, end_local and radius, and proximity_vertices"
         raise BadInput(HAND_REFERENCE, expected, f"{type(error).__name__}: {error}") from error
-    right = start.shape == end.shape == (N_CAPSULES, 3) and radius.shape == (N_CAPSULES,)
-    if not right or not np.isfinite([*start.flat, *end.flat, *radius]).all() or not (radius > 0).all():
+    has_shapes = start.shape == end.shape == (N_CAPSULES, 3) and radius.shape == (N_CAPSULES,)
+    if not has_shapes or not np.isfinite([*start.flat, *end.flat, *radius]).all() or not (radius > 0).all():
         expected = f"{N_CAPSULES} capsules of finite numbers with positive radii"
         raise BadInput(HAND_REFERENCE, expected, f"arrays {start.shape}, {end.shape}, {radius.shape}")
     if sensors.shape != (N_SENSORS,) or sensors.min() < 0 or sensors.max() >= _SHAPES["vertices"][0]:
@@ -304,7 +301,7 @@ def _read_skin(raw: RawTree) -> dict[str, np.ndarray]:
 
 
 def _rigid(poses: np.ndarray) -> np.ndarray:
-    """Float32 poses (..., 4, 4) with the nearest exact rotations."""
+    """Project the rotations of float32 poses (..., 4, 4) to the closest exact rotations."""
     u, _, v = np.linalg.svd(poses[..., :3, :3])
     poses = poses.copy()
     poses[..., :3, :3] = u @ v
@@ -314,7 +311,7 @@ def _rigid(poses: np.ndarray) -> np.ndarray:
 def _sensing_skin(
     skin: dict[str, np.ndarray], sensors: np.ndarray, tip_joint: np.ndarray, tip_m: np.ndarray, to_joint: RigidTransform
 ) -> Skin:
-    """The tips, each fixed to its finger's last joint, then the sensors."""
+    """Skin points: the fingertips, each attached to its finger's last joint, then the sensors."""
     bones, values = skin["bone_indices"][sensors], skin["bone_weights"][sensors]
     weight = np.zeros((len(tip_joint) + len(sensors), 17))
     weight[np.arange(len(tip_joint)), tip_joint] = 1.0
@@ -328,29 +325,29 @@ def _sensing_skin(
 
 
 def _rest_rotmats(joint_from_skin: np.ndarray, skeleton: BvhMotion) -> np.ndarray:
-    """(16, 3, 3) of the bind pose. The skin says nothing of the thumb's base: it turns as little as can be."""
+    """(16, 3, 3) local rotations of the bind pose; the thumb's base, which the skin lacks, rotates minimally."""
     skin_from_joint = np.linalg.inv(joint_from_skin)
-    turn, place = skin_from_joint[:, :3, :3], skin_from_joint[:, :3, 3]
-    wanted = turn[0].T @ (place[THUMB_BASE + 1] - place[0]) - skeleton.offsets[THUMB_BASE]
-    turn[THUMB_BASE] = turn[0] @ _least_turn(skeleton.offsets[THUMB_BASE + 1], wanted)
-    return turn[skeleton.parents[1:]].swapaxes(1, 2) @ turn[1:]
+    rotation, position = skin_from_joint[:, :3, :3], skin_from_joint[:, :3, 3]
+    knuckle_offset = rotation[0].T @ (position[THUMB_BASE + 1] - position[0]) - skeleton.offsets[THUMB_BASE]
+    rotation[THUMB_BASE] = rotation[0] @ _smallest_rotation(skeleton.offsets[THUMB_BASE + 1], knuckle_offset)
+    return rotation[skeleton.parents[1:]].swapaxes(1, 2) @ rotation[1:]
 
 
-def _least_turn(start: np.ndarray, stop: np.ndarray) -> np.ndarray:
-    """The smallest turn that takes one direction to another, not opposite, one."""
-    a, b = start / np.linalg.norm(start), stop / np.linalg.norm(stop)
+def _smallest_rotation(from_direction: np.ndarray, to_direction: np.ndarray) -> np.ndarray:
+    """The smallest rotation from one direction to another, which must not be opposite."""
+    a, b = from_direction / np.linalg.norm(from_direction), to_direction / np.linalg.norm(to_direction)
     x, y, z = np.cross(a, b)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + cross + cross @ cross / (1 + a @ b)
 
 
 def _last_joints(parents: np.ndarray) -> np.ndarray:
-    """Those without children, one a finger: thumb, index, middle, ring, pinky."""
+    """Joints without children, one per finger: thumb, index, middle, ring, pinky."""
     return np.setdiff1d(np.arange(len(parents)), parents)
 
 
 def _hinges(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Axes (17, 3) and limits (17, 2): an angle about the files' z axis is one about -z in the mirror."""
+    """Hinge axes (17, 3) and limits (17, 2) in radians. Negating x turns an angle about z into one about -z."""
     axis, limit = np.zeros((len(names), 3)), np.zeros((len(names), 2))
     for joint, name in enumerate(names):
         for ending, degrees in LIMITS_DEG.items():

@@ -1,9 +1,9 @@
-"""OakInk2 (Zhan et al. 2024): motion capture of both hands and of every part of every object, 120 frames a second.
+"""OakInk2 (Zhan et al. 2024): motion capture of both hands and of all object parts at 120 Hz.
 
-A recording is a long task; its program names the primitives in it, with a range of frames for each hand. Each becomes
-a clip of the frames of both ranges. The object of a clip is the first one the leading hand is said to have to do with,
-the others the program names are its other objects. Parts are tracked one by one: two parts of one object whose motion
-is a turn about one axis are joined by that hinge, all others stay objects of their own.
+A recording is a long task. Its program lists primitives with a range of frames for each hand. Each primitive becomes a
+clip that covers both ranges. The clip's object is the first one in the list of the leading hand. The other listed
+objects are the clip's other objects. Parts are tracked separately. Two parts of one object that rotate about a common
+axis are joined by a hinge; all other parts are separate objects.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,13 +15,13 @@ import numpy as np
 
 from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, to_track
-from hoidata.dataset_folders import facts_beside
-from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
-from hoidata.datasets.gaps import bridge, has_pose, missing_poses, numbered, trimmed
+from hoidata.dataset_folders import facts_of_adapter
+from hoidata.datasets.base import AdapterBase, DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.gaps import bridge, has_pose, mark_interpolated, missing_poses, trim_to_recorded
 from hoidata.datasets.hinge import HingeFit, box_corners, hinge_between, hinged_model
 from hoidata.datasets.known_meshes import raw_mesh
 from hoidata.datasets.oakink2.files import (
-    LARGEST_JSON_BYTES,
+    MAX_JSON_BYTES,
     STEP,
     Annotation,
     Range,
@@ -42,7 +42,7 @@ from hoidata.objects.model import ObjectModel
 
 ANNOTATIONS = ("anno_preview", "anno")
 PROGRAM = "program/program_info"
-OBJECTS = ("object_repair", "object_raw", "object_preview")  # repaired, as scanned, the older name of the latter
+OBJECTS = ("object_repair", "object_raw", "object_preview")  # repaired, as scanned, an older name of the scanned ones
 TREE = "object_affordance/object_part_tree.json"
 FRAME = WorldFrame(None, "unknown", "the world of the motion capture, right-handed, metres, axes not documented")
 GRAVITY_NOTE = "OakInk2 does not say which way is up; converters of others take y for up"
@@ -66,31 +66,28 @@ PARTS = (
 )
 
 
-class Thing(NamedTuple):
-    """A part, or two with a hinge, short gaps in its poses bridged. tracked: (frame,) bool, poses of the source.
+class SceneObject(NamedTuple):
+    """A part, or two parts joined by a hinge."""
 
-    words: None where it has no name. note: how the parts keep to the hinge, or "".
-    """
-
-    track: ObjectTrack
-    tracked: np.ndarray
-    words: str | None
-    note: str = ""
-    left_out: tuple[Quarantined, ...] = ()
+    track: ObjectTrack  # short gaps are interpolated
+    tracked: np.ndarray  # (frame,) bool: the source has a pose
+    words: str | None  # None if it has no name
+    note: str = ""  # residuals of the hinge
+    rejected_frames: tuple[Quarantined, ...] = ()
 
 
 @dataclass(frozen=True)
-class Oakink2Adapter(Described):
+class Oakink2Adapter(AdapterBase):
     """Raw root: ``anno_preview``, ``program``, ``object_repair`` (or ``object_raw``), ``object_affordance``.
 
-    margin_frames: kept before and after each primitive; shortest_frames: shorter ones are no clips; both at 30 fps.
-    most_off_mm, most_off_deg: frames in which two parts lie farther off their hinge are left out; parts farther off in
-    more than 5 % of all frames have none. Recordings are named as the source writes them, with ``/`` for ``++``.
+    Recordings are named as in the source, with ``/`` for ``++``.
     """
 
-    facts = facts_beside(__file__)
-    margin_frames: int = 0
-    shortest_frames: int = 20
+    facts = facts_of_adapter(__file__)
+    margin_frames: int = 0  # at 30 fps: frames kept before and after each primitive
+    shortest_frames: int = 20  # at 30 fps: shorter primitives give no clip
+    # Frames in which two parts are farther off their hinge are excluded. Parts that exceed a limit in more than 5 % of
+    # the frames are not joined.
     most_off_mm: int = 20
     most_off_deg: int = 10
     frame: WorldFrame = FRAME
@@ -98,26 +95,42 @@ class Oakink2Adapter(Described):
     parts: tuple[DatasetPart, ...] = PARTS
 
     def sequences(self, root: Path) -> list[SequenceKey]:
-        """One key per annotation; its subject is what ends the scene's name, ``A001`` of ``scene_01__A001``."""
+        """One key per annotation. The subject is the suffix of the scene's name, ``A001`` of ``scene_01__A001``."""
         tokens = {path.stem for folder in ANNOTATIONS for path in Path(root).glob(f"{folder}/*.pkl")}
         names = [token.replace("++", "/") for token in tokens]
         return sorted(SequenceKey(self.name, name.partition("/")[0].rpartition("__")[2], name) for name in names)
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
-        """Clips of one recording, and the primitives and frames that cannot be used, with their reasons."""
+        """Clips of one recording, and reasons for unusable primitives and frames."""
         token = key.name.replace("/", "++")
         paths = [f"{folder}/{token}.pkl" for folder in ANNOTATIONS]
-        path = next((own for own in paths if raw.has(own)), paths[0])
-        seen = read_annotation(raw.read(path), path)
-        program = read_program(raw.read(where := f"{PROGRAM}/{token}.json", LARGEST_JSON_BYTES), where)
-        scene = Scene(raw, str(key), path, seen, *object_names(raw), self.most_off_mm, self.most_off_deg)
-        tracks: dict[Side, HandTrack] = {side: to_track(seen.hands[side], CONVENTION, hands[side]) for side in SIDES}
+        path = next((candidate for candidate in paths if raw.has(candidate)), paths[0])
+        annotation = read_annotation(raw.read(path), path)
+        program = read_program(raw.read(program_path := f"{PROGRAM}/{token}.json", MAX_JSON_BYTES), program_path)
+        names, roots = object_names(raw)
+        scene = Scene(
+            raw=raw,
+            key=str(key),
+            path=path,
+            annotation=annotation,
+            names=names,
+            roots=roots,
+            most_off_mm=self.most_off_mm,
+            most_off_deg=self.most_off_deg,
+        )
+        tracks: dict[Side, HandTrack] = {
+            side: to_track(annotation.hands[side], CONVENTION, hands[side]) for side in SIDES
+        }
         results = list[Clip | Quarantined]()
         for segment in program:
-            things = scene.things(segment.objects)
-            reason = _reason(segment, things)
+            objects = scene.objects_of(segment.objects)
+            reason = _unusable_reason(segment, objects)
             if reason is not None:
-                results.append(Quarantined(f"{key}/{segment.name}", where, *reason, "nothing to do"))
+                expected, got = reason
+                name = f"{key}/{segment.name}"
+                results.append(
+                    Quarantined(name, where=program_path, expected=expected, got=got, remedy="nothing to do")
+                )
                 continue
             whole = Clip(
                 clip_id=f"{key}/{segment.name}",
@@ -125,143 +138,165 @@ class Oakink2Adapter(Described):
                 subject=key.subject,
                 sequence=key.name,
                 hands=tracks,
-                object=things[0].track,
-                source_frames=seen.frames.astype(np.int32),
+                object=objects[0].track,
+                source_frames=annotation.frames.astype(np.int32),
                 gravity=None,
                 verb=verb_of(segment.primitive),
-                object_words=str(things[0].words),
+                object_words=str(objects[0].words),
                 labelled_hand=segment.hand,
-                other_objects=tuple(thing.track for thing in things[1:]),
+                other_objects=tuple(other.track for other in objects[1:]),
                 source_fps=self.source_fps,
-                gravity_note="; ".join([GRAVITY_NOTE, *(thing.note for thing in things if thing.note)]),
+                gravity_note="; ".join(
+                    [GRAVITY_NOTE, *(scene_object.note for scene_object in objects if scene_object.note)]
+                ),
             )
-            results += self._cut(whole, where, segment.span, things)
-        results += scene.left_out
+            results += self._cut(whole, program_path, segment.span, objects)
+        results += scene.rejected_frames
         return [replace(item, sources=raw.sources) if isinstance(item, Clip) else item for item in results]
 
-    def _cut(self, whole: Clip, where: str, span: Range, things: list[Thing]) -> Iterator[Clip | Quarantined]:
-        """The intervals of a primitive in which its objects have poses."""
+    def _cut(
+        self, whole: Clip, program_path: str, span: Range, objects: list[SceneObject]
+    ) -> Iterator[Clip | Quarantined]:
+        """One clip per interval of a primitive in which all its objects have poses. span: frames at 120 Hz."""
         frames, margin = whole.source_frames, self.margin_frames * STEP
         inside = (frames >= span[0] - margin) & (frames < span[1] + margin)
-        known, recorded = (np.logical_and.reduce([of(own.tracked) for own in things]) for of in (has_pose, np.asarray))
-        found = [trimmed(piece, recorded) for piece in runs(inside & known)]
-        for thing in things:
-            name, tracked = thing.track.model.name, thing.tracked[inside]
-            yield from missing_poses(f"{whole.clip_id}/missing {name}", where, name, frames[inside], tracked)
-        long = [piece for piece in found if piece.stop - piece.start >= self.shortest_frames]
-        if not long:
-            got = f"{max((b - a for a, b in found), default=0)} in mocap frames {span[0]} to {span[1] - 1}"
+        all_have_pose, recorded = (
+            np.logical_and.reduce([frames_of(item.tracked) for item in objects]) for frames_of in (has_pose, np.asarray)
+        )
+        intervals = [trim_to_recorded(piece, recorded) for piece in runs(inside & all_have_pose)]
+        for scene_object in objects:
+            name, tracked = scene_object.track.model.name, scene_object.tracked[inside]
+            yield from missing_poses(f"{whole.clip_id}/missing {name}", program_path, name, frames[inside], tracked)
+        accepted = [piece for piece in intervals if piece.stop - piece.start >= self.shortest_frames]
+        if not accepted:
+            got = f"{max((b - a for a, b in intervals), default=0)} in mocap frames {span[0]} to {span[1] - 1}"
             expected = f"{self.shortest_frames} frames (at 30 per second) with the objects"
-            yield Quarantined(whole.clip_id, where, expected, got, "nothing to do, or lower shortest_frames")
-        for start, stop in long:
-            own = "" if len(long) == 1 else f"/{frames[start]:06d}"
-            clip = replace(whole.take(slice(start, stop)), clip_id=f"{whole.clip_id}{own}")
-            yield replace(clip, source_frames=numbered(frames[start:stop], recorded[start:stop]))
+            remedy = "nothing to do, or lower shortest_frames"
+            yield Quarantined(whole.clip_id, where=program_path, expected=expected, got=got, remedy=remedy)
+        for start, stop in accepted:
+            suffix = "" if len(accepted) == 1 else f"/{frames[start]:06d}"
+            clip = replace(whole.take(slice(start, stop)), clip_id=f"{whole.clip_id}{suffix}")
+            yield replace(clip, source_frames=mark_interpolated(frames[start:stop], recorded[start:stop]))
 
 
-def _reason(segment: Segment, things: list[Thing]) -> tuple[str, str] | None:
-    """Expected and got, where a primitive cannot be a clip."""
+def _unusable_reason(segment: Segment, objects: list[SceneObject]) -> tuple[str, str] | None:
+    """Expected and actual, if a primitive cannot be a clip; else None."""
     if verb_of(segment.primitive) is None:
         return "a primitive with a name", repr(segment.primitive)[:40]
-    if not things:
+    if not objects:
         return "poses of an object of the primitive", f"none of {', '.join(segment.objects) or 'no objects'}"[:80]
-    if things[0].words is None:
-        return "a name of the object in obj_desc.json", f"none of {things[0].track.model.name}"
+    if objects[0].words is None:
+        return "a name of the object in obj_desc.json", f"none of {objects[0].track.model.name}"
     return None
 
 
 def object_names(raw: RawTree) -> tuple[dict[str, str], dict[str, str]]:
-    """Names of objects, and the object each part belongs to."""
+    """Names by id, and the root object by part id."""
     paths = [f"{folder}/obj_desc.json" for folder in OBJECTS]
-    path = next((own for own in paths if raw.has(own)), paths[0])
-    roots = read_roots(raw.read(TREE, LARGEST_JSON_BYTES), TREE) if raw.has(TREE) else {}
-    return read_names(raw.read(path, LARGEST_JSON_BYTES), path), roots
+    path = next((candidate for candidate in paths if raw.has(candidate)), paths[0])
+    roots = read_roots(raw.read(TREE, MAX_JSON_BYTES), TREE) if raw.has(TREE) else {}
+    return read_names(raw.read(path, MAX_JSON_BYTES), path), roots
 
 
 @dataclass
 class Scene:
-    """The objects of a recording, each made when a primitive first names it."""
+    """The objects of a recording, each created when a primitive first names it."""
 
     raw: RawTree
     key: str
     path: str
-    seen: Annotation
+    annotation: Annotation
     names: Mapping[str, str]
     roots: Mapping[str, str]
     most_off_mm: int
     most_off_deg: int
-    _things: dict[str, Thing] = field(default_factory=dict)
+    _objects: dict[str, SceneObject] = field(default_factory=dict)
 
     @property
-    def left_out(self) -> list[Quarantined]:
-        """Frames in which parts lie too far off their hinge, of the objects made so far."""
-        return [reason for thing in _distinct(list(self._things.values())) for reason in thing.left_out]
+    def rejected_frames(self) -> list[Quarantined]:
+        """Reasons for frames in which parts are too far off their hinge, for the objects created so far."""
+        return [reason for item in _unique(list(self._objects.values())) for reason in item.rejected_frames]
 
-    def things(self, parts: Sequence[str]) -> list[Thing]:
-        """The objects some parts belong to, each once, in the order of the parts; none for parts without poses."""
-        return _distinct([self.thing(name) for name in parts if name in self.seen.parts])
+    def objects_of(self, parts: Sequence[str]) -> list[SceneObject]:
+        """The objects of some parts, each once, in the order of the parts. Parts without poses are skipped."""
+        return _unique([self.object_of(name) for name in parts if name in self.annotation.parts])
 
-    def thing(self, name: str) -> Thing:
-        """The object a part belongs to where it has a hinge, else the part alone."""
-        if name not in self._things:
+    def object_of(self, name: str) -> SceneObject:
+        """The object of a part: two parts joined by a hinge, or the part alone."""
+        if name not in self._objects:
             root = self.roots.get(name, name)
-            same = [part for part in self.seen.parts if self.roots.get(part, part) == root]
+            same = [part for part in self.annotation.parts if self.roots.get(part, part) == root]
             pair = same if len(same) == 2 else [name]
             joined = self._hinged(root, pair) if len(pair) == 2 else None
-            self._things |= dict.fromkeys(pair, joined) if joined else {part: self._part(part) for part in pair}
-        return self._things[name]
+            self._objects |= dict.fromkeys(pair, joined) if joined else {part: self._part(part) for part in pair}
+        return self._objects[name]
 
     def _mesh(self, name: str) -> Mesh:
-        """The one mesh in the folder of a part."""
+        """Read the only mesh in the folder of a part."""
         folders = [f"{folder}/align_ds/{name}" for folder in OBJECTS]
-        found = {own: [n for n in self.raw.names(own) if n.lower().endswith((".obj", ".ply"))] for own in folders}
-        folder = next((own for own in folders if found[own]), folders[0])
-        if len(found[folder]) != 1:
-            got = ", ".join(found[folder]) or "none"
+        meshes = {
+            folder_path: [n for n in self.raw.names(folder_path) if n.lower().endswith((".obj", ".ply"))]
+            for folder_path in folders
+        }
+        folder = next((folder_path for folder_path in folders if meshes[folder_path]), folders[0])
+        if len(meshes[folder]) != 1:
+            got = ", ".join(meshes[folder]) or "none"
             raise BadInput(folder, "one mesh, OBJ or PLY", got, "unpack object_repair.tar or object_raw.tar here")
-        return raw_mesh(self.raw, f"{folder}/{found[folder][0]}")
+        return raw_mesh(self.raw, f"{folder}/{meshes[folder][0]}")
 
     def _words(self, *ids: str) -> str | None:
         return next((noun_of(self.names[name]) for name in ids if self.names.get(name, "").strip(" _")), None)
 
-    def _part(self, name: str) -> Thing:
-        mesh, poses = self._mesh(name), self.seen.parts[name]
+    def _part(self, name: str) -> SceneObject:
+        mesh, poses = self._mesh(name), self.annotation.parts[name]
         model = ObjectModel(name, mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), np.uint8))
-        return Thing(bridge(_track(model, poses.world_from_part), poses.tracked), poses.tracked, self._words(name))
+        return SceneObject(
+            bridge(_track(model, poses.world_from_part), poses.tracked), poses.tracked, self._words(name)
+        )
 
-    def _hinged(self, root: str, pair: list[str]) -> Thing | None:
-        """Two parts as one object, the one with the bigger surface as its base; None where no hinge fits them.
+    def _hinged(self, root: str, pair: list[str]) -> SceneObject | None:
+        """Join two parts by a hinge. The part with the larger surface is the base. None if no hinge fits.
 
-        At rest both lie as their meshes do, which share a frame; where that fits no hinge, as in the first frame.
+        The pose at rest is that of the meshes, which share a frame. If no hinge fits it, the first frame is the pose at
+        rest.
         """
         meshes = {name: self._mesh(name) for name in pair}
         base, moving = sorted(pair, key=lambda name: (-_surface_m2(meshes[name]), name))
-        tracked = self.seen.parts[base].tracked & self.seen.parts[moving].tracked
+        tracked = self.annotation.parts[base].tracked & self.annotation.parts[moving].tracked
         if tracked.sum() < 2:
             return None
-        poses = [self.seen.parts[name].world_from_part[tracked] for name in (base, moving)]
+        poses = [self.annotation.parts[name].world_from_part[tracked] for name in (base, moving)]
         relative = np.linalg.inv(poses[0]) @ poses[1]
-        own, faces = meshes[base].vertices, [meshes[name].faces for name in (base, moving)]
+        base_vertices, faces = meshes[base].vertices, [meshes[name].faces for name in (base, moving)]
         limits = (self.most_off_mm, self.most_off_deg)
         for rest in (np.eye(4), relative[0]):
-            moved = meshes[moving].vertices @ rest[:3, :3].T + rest[:3, 3]
-            corners = box_corners(own), box_corners(moved)
-            found = hinge_between(poses[0], relative @ np.linalg.inv(rest), corners, *limits)
-            if found is not None:
-                model = hinged_model(root, [own, moved], faces, found[0])
-                return self._joined(model, found[1], tracked, self._words(root, base))
+            moving_vertices = meshes[moving].vertices @ rest[:3, :3].T + rest[:3, 3]
+            corners = box_corners(base_vertices), box_corners(moving_vertices)
+            hinge_fit = hinge_between(poses[0], relative @ np.linalg.inv(rest), corners, *limits)
+            if hinge_fit is not None:
+                model = hinged_model(root, [base_vertices, moving_vertices], faces, hinge_fit[0])
+                return self._joined(model, hinge_fit[1], tracked, self._words(root, base))
         return None
 
-    def _joined(self, model: ObjectModel, fit: HingeFit, tracked: np.ndarray, words: str | None) -> Thing:
+    def _joined(self, model: ObjectModel, fit: HingeFit, tracked: np.ndarray, words: str | None) -> SceneObject:
         limits, frames = (self.most_off_mm, self.most_off_deg), np.flatnonzero(tracked)
-        off, good = fit.off(*limits), tracked.copy()
-        good[frames[off]] = False
-        name = f"{self.key}/hinge of {model.name}"
-        left_out = (fit.left_out(name, self.path, self.seen.frames[frames], *limits),) if off.any() else ()
-        # Frames in which one of both is not tracked repeat the one before, until short gaps are bridged.
-        source = np.clip(np.searchsorted(frames, np.arange(len(tracked)), side="right") - 1, 0, None)
-        track = _track(model, fit.world_from_object[source], fit.hinge_rad[source])
-        return Thing(bridge(track, good), good, words, f"{model.name}: {fit.note}", left_out)
+        exceeds, used_frames = fit.exceeds(*limits), tracked.copy()
+        used_frames[frames[exceeds]] = False
+        reason_key = f"{self.key}/hinge of {model.name}"
+        rejected_frames: tuple[Quarantined, ...] = ()
+        if exceeds.any():
+            source_frames = self.annotation.frames[frames]
+            rejected_frames = (fit.rejected_frames_reason(reason_key, self.path, source_frames, *limits),)
+        # Frames in which a part is untracked repeat the previous pose, until short gaps are interpolated.
+        last_tracked = np.clip(np.searchsorted(frames, np.arange(len(tracked)), side="right") - 1, 0, None)
+        track = _track(model, fit.world_from_object[last_tracked], fit.hinge_rad[last_tracked])
+        return SceneObject(
+            track=bridge(track, used_frames),
+            tracked=used_frames,
+            words=words,
+            note=f"{model.name}: {fit.note}",
+            rejected_frames=rejected_frames,
+        )
 
 
 def _surface_m2(mesh: Mesh) -> float:
@@ -269,11 +304,11 @@ def _surface_m2(mesh: Mesh) -> float:
     return float(np.linalg.norm(np.cross(second - first, third - first), axis=1).sum() / 2)
 
 
-def _distinct(things: Sequence[Thing]) -> list[Thing]:
-    return list({id(thing): thing for thing in things}.values())
+def _unique(objects: Sequence[SceneObject]) -> list[SceneObject]:
+    return list({id(item): item for item in objects}.values())
 
 
 def _track(model: ObjectModel, poses: np.ndarray, hinge_rad: np.ndarray | None = None) -> ObjectTrack:
     angle = None if hinge_rad is None else hinge_rad.astype(np.float32)
-    rotvec, place = rotmat_to_rotvec(poses[:, :3, :3]), poses[:, :3, 3]
-    return ObjectTrack(model, rotvec.astype(np.float32), place.astype(np.float32), angle)
+    rotvec, position = rotmat_to_rotvec(poses[:, :3, :3]), poses[:, :3, 3]
+    return ObjectTrack(model, rotvec.astype(np.float32), position.astype(np.float32), angle)

@@ -1,6 +1,6 @@
-"""OakInk2's files: annotations (a pickle of tensors and arrays), programs, names, the tree of parts. Nothing is run.
+"""Readers of OakInk2's files: annotations (pickled tensors, loaded without code), programs, names, the tree of parts.
 
-Its words: primitives of the programs as verbs, what the toolkit leaves unnamed, names of objects.
+Also the words: verbs of the programs' primitives and names of objects.
 """
 
 import ast
@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-import orjson
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import FPS, SIDES, HandType, Side
@@ -19,7 +18,7 @@ from hoidata.errors import BadInput
 from hoidata.files import load_torch_pickle
 
 UNKNOWN = "?(unk)"
-# Primitive -> verb, where it is not the primitive itself with blanks for underscores: the object is named by itself.
+# Verbs of primitives that differ from the primitive's words, because the sentence names the object separately.
 _VERBS = {
     "brush_whiteboard": "brush with",
     "cap_the_pen": "cap",
@@ -78,7 +77,7 @@ _VERBS = {
 
 
 def verb_of(primitive: str) -> str | None:
-    """The verb of a primitive, None where the makers could not name it."""
+    """The verb of a primitive; None if the authors did not name it."""
     if primitive == UNKNOWN or not primitive.strip(" _"):
         return None
     return _VERBS.get(primitive, " ".join(primitive.replace("_", " ").split()).lower())
@@ -91,220 +90,216 @@ def noun_of(name: str) -> str:
 
 MOCAP_FPS = 120
 STEP = MOCAP_FPS // FPS
-LARGEST_JSON_BYTES = 4 << 20
+MAX_JSON_BYTES = 4 << 20
 PREFIXES: Mapping[Side, str] = {"left": "lh__", "right": "rh__"}
 _LISTS = ("obj_list_lh", "obj_list_rh")
-MODES = {"lh_main": _LISTS[:1], "rh_main": _LISTS[1:], "bh_main": _LISTS}  # the lists of the hands that do it
+MODES = {"lh_main": _LISTS[:1], "rh_main": _LISTS[1:], "bh_main": _LISTS}  # object lists of the leading hands
 Range = tuple[int, int]
 PART_ID = re.compile(r"\w[\w@-]{0,60}")
 _KEY = re.compile(r"[\d\s(),\[\]None]{1,100}")
-_MOST_GAPS = 10  # frame numbers may reach this much farther than there are frames
-_LARGEST = 1e6
-_LAST_FRAME = 10**7  # a day at 120 Hz
+_MAX_GAP_RATIO = 10  # largest ratio of the range of frame numbers to their count
+_MAX_VALUE = 1e6
+_MAX_FRAME = 10**7  # a day at 120 Hz
 
 
 class Poses(NamedTuple):
-    """One part on the annotation's frames: (frame, 4, 4) world from part, identity where it is not tracked (frame,)."""
+    """Poses of one part on the annotation's frames."""
 
-    world_from_part: np.ndarray
-    tracked: np.ndarray
+    world_from_part: np.ndarray  # (frame, 4, 4), identity in untracked frames
+    tracked: np.ndarray  # (frame,) bool
 
 
 class Annotation(NamedTuple):
-    """30 of the 120 frames a second. frames: (frame,) mocap frame numbers, every fourth from the first one."""
+    """Hands and parts of one recording at 30 fps."""
 
-    frames: np.ndarray
-    parts: dict[str, Poses]
+    frames: np.ndarray  # (frame,) frame numbers at 120 Hz, every fourth from the first
+    parts: dict[str, Poses]  # by part id
     hands: dict[Side, SourceHand]
 
 
 class Segment(NamedTuple):
-    """One primitive of a program. left, right: mocap frames (start, stop) of each hand, half-open, or None.
+    """One primitive of a program."""
 
-    objects: ids of the parts it is about, those of the hand that does it first.
-    """
-
-    left: Range | None
+    left: Range | None  # frames at 120 Hz of the left hand, half-open; None if it is not involved
     right: Range | None
     primitive: str
-    objects: tuple[str, ...]
+    objects: tuple[str, ...]  # ids of the parts involved, the leading hand's first
 
     @property
     def span(self) -> Range:
-        """From the first frame of either hand to the last."""
-        starts, stops = zip(*(own for own in (self.left, self.right) if own), strict=True)
+        """The range that covers both hands."""
+        starts, stops = zip(*(hand_range for hand_range in (self.left, self.right) if hand_range), strict=True)
         return min(starts), max(stops)
 
     @property
     def hand(self) -> HandType:
+        """The hands that are involved."""
         return "both" if self.left and self.right else "left" if self.left else "right"
 
     @property
     def name(self) -> str:
-        """``left-1595-2340``, or both hands' ranges: no other primitive of the recording has it."""
+        """Unique name in the recording: ``left-1595-2340``, or both hands' ranges."""
         ranges = {"left": self.left, "right": self.right}
-        return "-".join(f"{side}-{own[0]}-{own[1]}" for side, own in ranges.items() if own)
+        return "-".join(f"{side}-{hand_range[0]}-{hand_range[1]}" for side, hand_range in ranges.items() if hand_range)
 
 
-def read_annotation(data: bytes, where: str) -> Annotation:
-    """Hands and parts of one recording, 30 frames a second. Raises BadInput."""
-    content = load_torch_pickle(data, where, arrays=True)
-    frames = _frames(f"{where}: mocap_frame_id_list", checks.entry(where, content, "mocap_frame_id_list"))
-    ids, poses, mano = (checks.entry(where, content, name) for name in ("obj_list", "obj_transf", "raw_mano"))
-    named = _part_ids(f"{where}: obj_list", ids)
-    parts = {name: _poses(f"{where}: obj_transf[{name!r}]", poses[name], frames) for name in named if name in poses}
-    hands: dict[Side, SourceHand] = {side: _hand(f"{where}: raw_mano", mano, side, frames) for side in SIDES}
+def read_annotation(data: bytes, path: str) -> Annotation:
+    """Read hands and parts of one recording at 30 fps. Raises BadInput."""
+    content = load_torch_pickle(data, path, arrays=True)
+    frames = _frames(f"{path}: mocap_frame_id_list", checks.entry(path, content, "mocap_frame_id_list"))
+    ids, poses, mano = (checks.entry(path, content, name) for name in ("obj_list", "obj_transf", "raw_mano"))
+    part_ids = _part_ids(f"{path}: obj_list", ids)
+    parts = {name: _poses(f"{path}: obj_transf[{name!r}]", poses[name], frames) for name in part_ids if name in poses}
+    hands: dict[Side, SourceHand] = {side: _hand(f"{path}: raw_mano", mano, side, frames) for side in SIDES}
     if not any(hand.valid is None or hand.valid.any() for hand in hands.values()):
-        raise BadInput(f"{where}: raw_mano", "parameters of a hand in one frame or more", "none")
+        raise BadInput(f"{path}: raw_mano", "parameters of a hand in one frame or more", "none")
     return Annotation(frames, parts, hands)
 
 
-def _frames(where: str, value: Any) -> np.ndarray:
+def _frames(location: str, value: Any) -> np.ndarray:
     if not isinstance(value, list) or not all(isinstance(number, int | np.integer) for number in value):
-        raise BadInput(where, "a list of frame numbers", repr(value)[:40])
-    if not value or min(value) < 0 or max(value) > _LAST_FRAME:
-        raise BadInput(where, f"frame numbers from 0 to {_LAST_FRAME}", repr(value[:3])[:40])
+        raise BadInput(location, "a list of frame numbers", repr(value)[:40])
+    if not value or min(value) < 0 or max(value) > _MAX_FRAME:
+        raise BadInput(location, f"frame numbers from 0 to {_MAX_FRAME}", repr(value[:3])[:40])
     numbers = np.array(value, dtype=np.int64)
-    if (np.diff(numbers) <= 0).any() or np.ptp(numbers) > _MOST_GAPS * len(numbers):
-        raise BadInput(where, "rising frame numbers without great gaps", f"{numbers[0]} to {numbers[-1]}")
+    if (np.diff(numbers) <= 0).any() or np.ptp(numbers) > _MAX_GAP_RATIO * len(numbers):
+        raise BadInput(location, "rising frame numbers without great gaps", f"{numbers[0]} to {numbers[-1]}")
     return np.arange(numbers[0], numbers[-1] + 1, STEP)
 
 
-def _part_ids(where: str, value: Any) -> list[str]:
+def _part_ids(location: str, value: Any) -> list[str]:
     if not isinstance(value, list) or not all(isinstance(name, str) and PART_ID.fullmatch(name) for name in value):
-        raise BadInput(where, "a list of part ids such as O02@0015@00001", repr(value)[:60])
+        raise BadInput(location, "a list of part ids such as O02@0015@00001", repr(value)[:60])
     return list(dict.fromkeys(value))
 
 
-def _poses(where: str, by_frame: Any, frames: np.ndarray) -> Poses:
+def _poses(location: str, by_frame: Any, frames: np.ndarray) -> Poses:
     if not isinstance(by_frame, Mapping):
-        raise BadInput(where, "a dictionary by frame number", type(by_frame).__name__)
+        raise BadInput(location, "a dictionary by frame number", type(by_frame).__name__)
     tracked = np.array([frame in by_frame for frame in frames.tolist()])
-    found, poses = [by_frame[frame] for frame in frames[tracked].tolist()], np.tile(np.eye(4), (len(frames), 1, 1))
-    if found:
-        rows = _stacked(where, found, (4, 4))
-        checks.rigid_transforms(where, [f"frame {frame}" for frame in frames[tracked]], rows)
+    matrices, poses = [by_frame[frame] for frame in frames[tracked].tolist()], np.tile(np.eye(4), (len(frames), 1, 1))
+    if matrices:
+        rows = _stack_arrays(location, matrices, (4, 4))
+        checks.rigid_transforms(location, [f"frame {frame}" for frame in frames[tracked]], rows)
         poses[tracked] = rows
     return Poses(poses, tracked)
 
 
-def _stacked(where: str, values: list[Any], shape: tuple[int, ...]) -> np.ndarray:
-    """(value, ...) float64 of arrays of one shape, which may have a leading axis of 1."""
+def _stack_arrays(location: str, values: list[Any], shape: tuple[int, ...]) -> np.ndarray:
+    """Stack arrays of one shape, or of that shape with a leading axis of 1, to (value, ...) float64."""
     arrays = [np.asarray(value) if isinstance(value, np.ndarray) else np.zeros(0) for value in values]
-    wrong = next((own for own in arrays if own.shape not in (shape, (1, *shape)) or own.dtype.kind != "f"), None)
+    shapes = (shape, (1, *shape))
+    wrong = next((array for array in arrays if array.shape not in shapes or array.dtype.kind != "f"), None)
     if wrong is not None:
-        raise BadInput(where, f"arrays of shape {shape}", f"{wrong.dtype} of shape {wrong.shape}")
-    rows = np.stack([own.reshape(shape) for own in arrays]).astype(np.float64)
-    checks.finite(where, rows)
-    if np.abs(rows).max() > _LARGEST:
-        raise BadInput(where, f"metres and quaternions, at most {_LARGEST:g}", f"{np.abs(rows).max():.3g}")
+        raise BadInput(location, f"arrays of shape {shape}", f"{wrong.dtype} of shape {wrong.shape}")
+    rows = np.stack([array.reshape(shape) for array in arrays]).astype(np.float64)
+    checks.finite(location, rows)
+    if np.abs(rows).max() > _MAX_VALUE:
+        raise BadInput(location, f"metres and quaternions, at most {_MAX_VALUE:g}", f"{np.abs(rows).max():.3g}")
     return rows
 
 
-def _hand(where: str, by_frame: Any, side: Side, frames: np.ndarray) -> SourceHand:
-    """Frames without an entry, or whose entry lacks this hand, are not valid."""
+def _hand(location: str, by_frame: Any, side: Side, frames: np.ndarray) -> SourceHand:
+    """The parameters of one hand. Frames whose entry is missing or lacks this hand are invalid."""
     if not isinstance(by_frame, Mapping):
-        raise BadInput(where, "a dictionary by frame number", type(by_frame).__name__)
+        raise BadInput(location, "a dictionary by frame number", type(by_frame).__name__)
     names = [f"{PREFIXES[side]}{name}" for name in ("pose_coeffs", "tsl", "betas")]
     entries = [by_frame.get(frame) for frame in frames.tolist()]
-    valid = np.array([isinstance(own, Mapping) and all(name in own for name in names) for own in entries])
-    rows = [own for own in entries if isinstance(own, Mapping) and all(name in own for name in names)]
+    valid = np.array([isinstance(entry, Mapping) and all(name in entry for name in names) for entry in entries])
+    valid_entries = [entry for entry in entries if isinstance(entry, Mapping) and all(name in entry for name in names)]
     values = [np.zeros((len(frames), columns)) for columns in (48, 3, 10)]
-    if rows:
+    if valid_entries:
         quaternions, *others = (
-            _stacked(f"{where}.{name}", [own[name] for own in rows], shape)
+            _stack_arrays(f"{location}.{name}", [entry[name] for entry in valid_entries], shape)
             for name, shape in zip(names, ((16, 4), (3,), (10,)), strict=True)
         )
-        found = [_rotvecs(f"{where}.{names[0]}", quaternions, frames[valid]), *others]
-        for whole, own in zip(values, found, strict=True):
-            whole[valid] = own
+        arrays = [_rotvecs(f"{location}.{names[0]}", quaternions, frames[valid]), *others]
+        for value, array in zip(values, arrays, strict=True):
+            value[valid] = array
     pose, translation_m, betas = values
-    return SourceHand(translation_m, pose[:, :3], pose[:, 3:], betas, valid)
+    return SourceHand(
+        translation_m=translation_m, global_orient=pose[:, :3], fingers=pose[:, 3:], betas=betas, valid=valid
+    )
 
 
-def _rotvecs(where: str, wxyz: np.ndarray, frames: np.ndarray) -> np.ndarray:
+def _rotvecs(location: str, wxyz: np.ndarray, frames: np.ndarray) -> np.ndarray:
     """(frame, 48) axis-angles of quaternions (frame, 16, 4)."""
-    off = np.abs(np.linalg.norm(wxyz, axis=-1) - 1).max(axis=1)
-    if (off > 1e-2).any():
-        first = int((off > 1e-2).argmax())
-        raise BadInput(where, "unit quaternions w x y z", f"one off by {off[first]:.3g} in frame {frames[first]}")
+    norm_error = np.abs(np.linalg.norm(wxyz, axis=-1) - 1).max(axis=1)
+    if (norm_error > 1e-2).any():
+        first = int((norm_error > 1e-2).argmax())
+        got = f"one off by {norm_error[first]:.3g} in frame {frames[first]}"
+        raise BadInput(location, "unit quaternions w x y z", got)
     return Rotation.from_quat(wxyz.reshape(-1, 4), scalar_first=True).as_rotvec().reshape(-1, 48)
 
 
-def read_program(data: bytes, where: str) -> list[Segment]:
-    """The primitives of one recording in the order of the file. Raises BadInput."""
-    program = _json(data, where)
+def read_program(data: bytes, path: str) -> list[Segment]:
+    """Read the primitives of one recording in the order of the file. Raises BadInput."""
+    program = checks.json_value(path, data)
     if not isinstance(program, Mapping):
-        raise BadInput(where, "a dictionary of primitives by their ranges", type(program).__name__)
-    found = [_segment(f"{where}: {key[:40]}", key, entry) for key, entry in program.items()]
-    return list({segment.name: segment for segment in found}.values())
+        raise BadInput(path, "a dictionary of primitives by their ranges", type(program).__name__)
+    segments = [_segment(f"{path}: {key[:40]}", key, entry) for key, entry in program.items()]
+    return list({segment.name: segment for segment in segments}.values())
 
 
-def _segment(where: str, key: str, entry: Any) -> Segment:
-    primitive, mode = (checks.entry(where, entry, name) for name in ("primitive", "interaction_mode"))
+def _segment(location: str, key: str, entry: Any) -> Segment:
+    primitive, mode = (checks.entry(location, entry, name) for name in ("primitive", "interaction_mode"))
     if not isinstance(primitive, str) or not isinstance(mode, str) or mode not in MODES:
-        raise BadInput(where, f"a primitive, and a mode of {', '.join(MODES)}", f"{primitive!r}, {mode!r}"[:60])
-    named = [checks.entry(where, entry, name) or [] for name in (*MODES[mode], "obj_list")]
-    objects = [name for names in named for name in _part_ids(f"{where}: objects", names)]
-    return Segment(*_ranges(where, key), primitive, tuple(dict.fromkeys(objects)))
+        raise BadInput(location, f"a primitive, and a mode of {', '.join(MODES)}", f"{primitive!r}, {mode!r}"[:60])
+    id_lists = [checks.entry(location, entry, name) or [] for name in (*MODES[mode], "obj_list")]
+    objects = [name for names in id_lists for name in _part_ids(f"{location}: objects", names)]
+    left, right = _ranges(location, key)
+    return Segment(left=left, right=right, primitive=primitive, objects=tuple(dict.fromkeys(objects)))
 
 
-def _ranges(where: str, key: str) -> tuple[Range | None, Range | None]:
+def _ranges(location: str, key: str) -> tuple[Range | None, Range | None]:
     """The two ranges in a key such as ``((1595, 2340), None)``, left hand first."""
     try:
         value = ast.literal_eval(key.strip()) if _KEY.fullmatch(key) else None
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
         value = None
-    pair = [_range(own) for own in value] if isinstance(value, tuple | list) else []
+    pair = [_range(item) for item in value] if isinstance(value, tuple | list) else []
     if len(pair) != 2 or pair == [None, None] or () in pair:
-        raise BadInput(where, "a range of frames of each hand, or None, as ((1595, 2340), None)", repr(key)[:60])
+        raise BadInput(location, "a range of frames of each hand, or None, as ((1595, 2340), None)", repr(key)[:60])
     return pair[0] or None, pair[1] or None
 
 
 def _range(value: Any) -> Range | tuple[()] | None:
-    """None for None, an empty tuple for what is no range."""
+    """Parse one range. Returns None for None and an empty tuple for an invalid range."""
     if value is None:
         return None
-    whole = isinstance(value, tuple | list) and len(value) == 2 and all(type(number) is int for number in value)
-    return (value[0], value[1]) if whole and 0 <= value[0] < value[1] <= _LAST_FRAME else ()
+    is_pair = isinstance(value, tuple | list) and len(value) == 2 and all(type(number) is int for number in value)
+    return (value[0], value[1]) if is_pair and 0 <= value[0] < value[1] <= _MAX_FRAME else ()
 
 
-def read_names(data: bytes, where: str) -> dict[str, str]:
-    """The name of each object or part by its id, of ``obj_desc.json``. Raises BadInput."""
-    value = _json(data, where)
+def read_names(data: bytes, path: str) -> dict[str, str]:
+    """Read ``obj_desc.json``: names by id of object or part. Raises BadInput."""
+    value = checks.json_value(path, data)
     if not isinstance(value, Mapping):
-        raise BadInput(where, "a dictionary of objects by id", type(value).__name__)
-    names = {key: checks.entry(f"{where}: {key[:40]}", entry, "obj_name") for key, entry in value.items()}
-    wrong = next((key for key, name in names.items() if not isinstance(name, str)), None)
-    if wrong is not None:
-        raise BadInput(f"{where}: {wrong[:40]}", "a name in words", repr(names[wrong])[:40])
+        raise BadInput(path, "a dictionary of objects by id", type(value).__name__)
+    names = {key: checks.entry(f"{path}: {key[:40]}", entry, "obj_name") for key, entry in value.items()}
+    unnamed = next((key for key, name in names.items() if not isinstance(name, str)), None)
+    if unnamed is not None:
+        raise BadInput(f"{path}: {unnamed[:40]}", "a name in words", repr(names[unnamed])[:40])
     return names
 
 
-def read_roots(data: bytes, where: str) -> dict[str, str]:
-    """The object each part belongs to, of ``object_part_tree.json``: id of the topmost node above it."""
-    value = _json(data, where)
+def read_roots(data: bytes, location: str) -> dict[str, str]:
+    """Read ``object_part_tree.json``: id of the root node by part id. Raises BadInput."""
+    value = checks.json_value(location, data)
     if not isinstance(value, Mapping) or not all(
-        isinstance(own, list) and all(isinstance(name, str) for name in own) for own in value.values()
+        isinstance(names, list) and all(isinstance(name, str) for name in names) for names in value.values()
     ):
-        raise BadInput(where, "a dictionary of lists of part ids", repr(value)[:40])
+        raise BadInput(location, "a dictionary of lists of part ids", repr(value)[:40])
     parent = {child: node for node, children in value.items() for child in children}
     topmost: dict[str, str] = {}
     for child in parent:
-        path = dict[str, None]()  # up to a part whose topmost one is known, so that no step is made twice
+        path = dict[str, None]()  # nodes visited up to a node whose root is known
         name: str = child
         while name in parent and name not in topmost:
             if name in path:
-                raise BadInput(where, "a tree of parts", f"{name[:40]!r} below itself")
+                raise BadInput(location, "a tree of parts", f"{name[:40]!r} below itself")
             path[name] = None
             name = parent[name]
         root: str = topmost.get(name, name)
         topmost |= {below: root for below in path}
     return topmost
-
-
-def _json(data: bytes, where: str) -> Any:
-    try:
-        return orjson.loads(data)
-    except ValueError as error:  # orjson.JSONDecodeError is one; text in another encoding too
-        raise BadInput(where, "JSON", str(error)[:80]) from error

@@ -1,7 +1,7 @@
 """TACO (Liu et al. 2024): two hands, a tool and a target; pickled torch tensors, meshes in centimetres, 30 fps.
 
-Each recording belongs to a triplet folder named ``(action, tool, object)``, which gives verb and words. The tool is the
-clip's object, the target its other object.
+The folder of a recording is named ``(action, tool, object)``, which gives verb and words. The tool is the clip's
+object. The target is its other object.
 """
 
 import re
@@ -14,9 +14,9 @@ import numpy as np
 
 from hoidata.clips.clip import SIDES, Clip, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, SourceHand, to_track
-from hoidata.dataset_folders import facts_beside
+from hoidata.dataset_folders import facts_of_adapter
 from hoidata.datasets import checks
-from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.base import AdapterBase, DatasetPart, Quarantined, RawTree, SequenceKey
 from hoidata.errors import BadInput
 from hoidata.files import load_npy, load_torch_pickle
 from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
@@ -29,7 +29,7 @@ CENTIMETRES = 1e-2
 TOUCH_M = 0.02
 HANDS, OBJECTS, MODELS = "Hand_Poses", "Object_Poses", "Object_Models"
 TRIPLET = re.compile(r"\(([^,()]+),([^,()]+),([^,()]+)\)")
-FRAME_KEY = re.compile(r"\D*(\d{1,9})")  # 00012, or a word before it
+FRAME_KEY = re.compile(r"\D*(\d{1,9})")  # 00012, with an optional prefix
 FRAME = WorldFrame(None, "unknown", "the capture rig's world of the recording day, right-handed, metres")
 SHAPE_NOTE = "no {side}_hand_shape.pkl: its betas are zero, as in TACO's own loader"
 GRAVITY_NOTE = "TACO's world frame differs from day to day and its axes are not documented"
@@ -50,27 +50,26 @@ Poses = Mapping[Hashable, Any]  # by frame key: {"hand_pose": (48,), "hand_trans
 
 
 @dataclass(frozen=True)
-class TacoAdapter(Described):
+class TacoAdapter(AdapterBase):
     """Raw root: ``Hand_Poses/``, ``Object_Poses/`` (``<triplet>/<recording>/``) and ``Object_Models/<id>_cm.obj``.
 
-    margin_frames: frames kept before the first and after the last one with a hand within 2 cm of the tool.
-    The source names no persons: a recording's subject is its day, the part of its name before the first underscore.
+    The source names no persons. The subject is the recording's day: its name up to the first underscore.
     """
 
-    facts = facts_beside(__file__)
-    margin_frames: int = 0
+    facts = facts_of_adapter(__file__)
+    margin_frames: int = 0  # frames kept before the first and after the last frame with a hand within 2 cm of the tool
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
     parts: tuple[DatasetPart, ...] = PARTS
 
     def sequences(self, root: Path) -> list[SequenceKey]:
-        """One key per recording that has hand or object poses, in a folder named as a triplet."""
-        found = {path for kind in (HANDS, OBJECTS) for path in Path(root).glob(f"{kind}/(*)/*") if path.is_dir()}
-        days = {f"{path.parent.name}/{path.name}": path.name.partition("_")[0] for path in found}
+        """One key per recording with hand or object poses in a folder named like a triplet."""
+        folders = {path for kind in (HANDS, OBJECTS) for path in Path(root).glob(f"{kind}/(*)/*") if path.is_dir()}
+        days = {f"{path.parent.name}/{path.name}": path.name.partition("_")[0] for path in folders}
         return sorted(SequenceKey(self.name, day, name) for name, day in days.items())
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
-        """One clip, from the first to the last frame with a hand at the tool."""
+        """One clip from the first to the last frame with a hand at the tool, and a reason per missing hand shape."""
         verb, tool_word, _ = triplet(key.name)
         tool, target = (_object(raw, key, kind) for kind in ("tool", "target"))
         if target.n_frames != tool.n_frames:
@@ -90,17 +89,17 @@ class TacoAdapter(Described):
             object_words=tool_word,
             source_fps=self.source_fps,
         )
-        start, stop = _touched(whole, hands)
+        start, stop = _contact_range(whole, hands)
         clip = whole.take(slice(max(0, start - self.margin_frames), stop + self.margin_frames))
         without_shape: list[Side] = [side for side in SIDES if not _has_shape(raw, key, side)]
         notes = [clip.gravity_note, *(SHAPE_NOTE.format(side=side) for side in without_shape)]
         reasons = [
             Quarantined(
                 f"{key}/{side}-shape",
-                _shape_path(key, side),
-                "the shape of the hand",
-                "no file",
-                "nothing to do: the clip has zero betas, as TACO's own loader gives them",
+                where=_shape_path(key, side),
+                expected="the shape of the hand",
+                got="no file",
+                remedy="nothing to do: the clip has zero betas, as TACO's own loader gives them",
             )
             for side in without_shape
         ]
@@ -108,68 +107,80 @@ class TacoAdapter(Described):
 
 
 def triplet(name: str) -> tuple[str, str, str]:
-    """Action, tool and object in words of ``(put in, spoon, bowl)/20230927_034``. Raises BadInput for another form."""
+    """Action, tool and object from ``(put in, spoon, bowl)/20230927_034``. Raises BadInput for another form."""
     folder = name.partition("/")[0]
-    found = TRIPLET.fullmatch(folder)
-    if found is None:
+    match = TRIPLET.fullmatch(folder)
+    if match is None:
         raise BadInput(f"Hand_Poses/{folder}", "a folder named (action, tool, object)", folder, "restore its name")
-    action, tool, thing = (" ".join(word.replace("_", " ").split()) for word in found.groups())
-    return action.lower(), tool, thing
+    action, tool, target = (" ".join(word.replace("_", " ").split()) for word in match.groups())
+    return action.lower(), tool, target
 
 
-def frames_of(where: str, keys: Mapping[Side, list[Hashable]], n_frames: int) -> dict[Side, dict[Hashable, int]]:
-    """The frame each key of each side stands for; keys are numbers, of which one side may lack some.
+def frames_by_side(folder: str, keys: Mapping[Side, list[Hashable]], n_frames: int) -> dict[Side, dict[Hashable, int]]:
+    """Map each side's keys to frames. Keys are numbers, and a side may lack some.
 
-    Sorted keys as many as frames stand for them in turn. Where there are fewer, the other side's tell the numbering, or
-    the first and last number: from 0 to n - 1, or from 1 to n. Raises BadInput where neither tells it.
+    If a side has one key per frame, its sorted keys are the frames in order. If neither side is complete, the numbers
+    must be 0 to n - 1 or 1 to n, as the first and last number show.
+
+    Args:
+        folder: of the recording, for errors.
+        keys: of both sides.
+        n_frames: number of frames of the objects.
+
+    Raises:
+        BadInput: the numbering is ambiguous, or a number is out of range.
     """
     numbers: dict[Side, dict[Hashable, int]] = {
-        side: _numbers(f"{where}/{side}_hand.pkl", keys[side], n_frames) for side in SIDES
+        side: _numbers(f"{folder}/{side}_hand.pkl", keys[side], n_frames) for side in SIDES
     }
-    complete = next((sorted(found.values()) for found in numbers.values() if len(found) == n_frames), None)
+    complete = next(
+        (sorted(side_numbers.values()) for side_numbers in numbers.values() if len(side_numbers) == n_frames), None
+    )
     if complete is None:
-        first = _first_number(where, {number for found in numbers.values() for number in found.values()}, n_frames)
+        first = _first_number(
+            folder, {number for side_numbers in numbers.values() for number in side_numbers.values()}, n_frames
+        )
         complete = list(range(first, first + n_frames))
     frame = {number: index for index, number in enumerate(complete)}
-    placed: dict[Side, dict[Hashable, int]] = {}
-    for side, found in numbers.items():
-        unknown = sorted(set(found.values()) - set(frame))
-        if unknown and len(found) < n_frames:
+    frames_by_key: dict[Side, dict[Hashable, int]] = {}
+    for side, side_numbers in numbers.items():
+        unknown = sorted(set(side_numbers.values()) - set(frame))
+        if unknown and len(side_numbers) < n_frames:
             expected = f"frame numbers {complete[0]} to {complete[-1]}"
-            raise BadInput(f"{where}/{side}_hand.pkl", expected, f"{unknown[0]}")
-        in_turn = sorted(found, key=found.__getitem__)
-        whole = len(found) == n_frames
-        placed[side] = {key: at if whole else frame[found[key]] for at, key in enumerate(in_turn)}
-    return placed
+            raise BadInput(f"{folder}/{side}_hand.pkl", expected, f"{unknown[0]}")
+        in_turn = sorted(side_numbers, key=side_numbers.__getitem__)
+        is_complete = len(side_numbers) == n_frames
+        frames_by_key[side] = {key: at if is_complete else frame[side_numbers[key]] for at, key in enumerate(in_turn)}
+    return frames_by_key
 
 
-def _numbers(where: str, keys: list[Hashable], n_frames: int) -> dict[Hashable, int]:
-    found = {key: FRAME_KEY.fullmatch(str(key)) for key in keys}
-    numbers = {key: int(match[1]) for key, match in found.items() if match is not None}
+def _numbers(path: str, keys: list[Hashable], n_frames: int) -> dict[Hashable, int]:
+    matches = {key: FRAME_KEY.fullmatch(str(key)) for key in keys}
+    numbers = {key: int(match[1]) for key, match in matches.items() if match is not None}
     if len(numbers) < len(keys):
         wrong = next(key for key in keys if key not in numbers)
-        raise BadInput(where, "frame numbers as keys", repr(wrong)[:40])
+        raise BadInput(path, "frame numbers as keys", repr(wrong)[:40])
     if len(set(numbers.values())) < len(keys):
-        raise BadInput(where, "one entry per frame", "a frame number twice")
+        raise BadInput(path, "one entry per frame", "a frame number twice")
     if len(keys) > n_frames:
-        raise BadInput(where, f"at most {n_frames} frames as the tool", f"{len(keys)}")
+        raise BadInput(path, f"at most {n_frames} frames as the tool", f"{len(keys)}")
     return numbers
 
 
-def _first_number(where: str, numbers: set[int], n_frames: int) -> int:
+def _first_number(folder: str, numbers: set[int], n_frames: int) -> int:
     if numbers and 0 in numbers and max(numbers) < n_frames:
         return 0
     if numbers and min(numbers) > 0 and max(numbers) == n_frames:
         return 1
     got = f"{len(numbers)} numbers, {min(numbers)} to {max(numbers)}" if numbers else "none"
     remedy = "nothing to do: both hands lack frames, and which ones cannot be told"
-    raise BadInput(where, f"hand poses numbered 0 to {n_frames - 1} or 1 to {n_frames}", got, remedy)
+    raise BadInput(folder, f"hand poses numbered 0 to {n_frames - 1} or 1 to {n_frames}", got, remedy)
 
 
 def _hands(raw: RawTree, key: SequenceKey, tool: ObjectTrack) -> dict[Side, SourceHand]:
     folder = f"{HANDS}/{key.name}"
     poses: dict[Side, Poses] = {side: _dictionary(raw, f"{folder}/{side}_hand.pkl") for side in SIDES}
-    frames = frames_of(folder, {side: list(poses[side]) for side in SIDES}, tool.n_frames)
+    frames = frames_by_side(folder, {side: list(poses[side]) for side in SIDES}, tool.n_frames)
     return {side: _hand(raw, key, side, poses[side], frames[side], tool.n_frames) for side in SIDES}
 
 
@@ -178,31 +189,37 @@ def _shape_path(key: SequenceKey, side: Side) -> str:
 
 
 def _has_shape(raw: RawTree, key: SequenceKey, side: Side) -> bool:
-    """Whether a hand's shape is there, or is listed in the manifest and so has to be."""
+    """Whether a hand's shape file exists. If the manifest lists it, it is required."""
     path = _shape_path(key, side)
     return raw.has(path) or path in (raw.manifest or ())
 
 
 def _betas(raw: RawTree, key: SequenceKey, side: Side) -> np.ndarray:
-    """(1, 10), zero where there is no file: so reads TACO's own loader (``read_hand_shape`` of its dataset_utils)."""
+    """(1, 10) betas, zero without a file, as in TACO's loader (``read_hand_shape`` of its dataset_utils)."""
     if not _has_shape(raw, key, side):
         return np.zeros((1, 10))
     path = _shape_path(key, side)
-    return _row(f"{path}: hand_shape", checks.entry(path, _dictionary(raw, path), "hand_shape"), 10)[None]
+    return _single_row(f"{path}: hand_shape", checks.entry(path, _dictionary(raw, path), "hand_shape"), 10)[None]
 
 
 def _hand(
     raw: RawTree, key: SequenceKey, side: Side, poses: Poses, frames: Mapping[Hashable, int], n_frames: int
 ) -> SourceHand:
-    where = f"{HANDS}/{key.name}/{side}_hand.pkl"
+    path = f"{HANDS}/{key.name}/{side}_hand.pkl"
     pose, translation_m = np.zeros((n_frames, 48)), np.zeros((n_frames, 3))
     valid = np.zeros(n_frames, dtype=bool)
     for frame_key, frame in frames.items():
-        place, entry = f"{where}: {frame_key}", poses[frame_key]
-        pose[frame] = _row(f"{place}.hand_pose", checks.entry(place, entry, "hand_pose"), 48)
-        translation_m[frame] = _row(f"{place}.hand_trans", checks.entry(place, entry, "hand_trans"), 3)
+        location, entry = f"{path}: {frame_key}", poses[frame_key]
+        pose[frame] = _single_row(f"{location}.hand_pose", checks.entry(location, entry, "hand_pose"), 48)
+        translation_m[frame] = _single_row(f"{location}.hand_trans", checks.entry(location, entry, "hand_trans"), 3)
         valid[frame] = True
-    return SourceHand(translation_m, pose[:, :3], pose[:, 3:], _betas(raw, key, side), valid)
+    return SourceHand(
+        translation_m=translation_m,
+        global_orient=pose[:, :3],
+        fingers=pose[:, 3:],
+        betas=_betas(raw, key, side),
+        valid=valid,
+    )
 
 
 def _dictionary(raw: RawTree, path: str) -> Mapping[Hashable, Any]:
@@ -212,10 +229,10 @@ def _dictionary(raw: RawTree, path: str) -> Mapping[Hashable, Any]:
     return value
 
 
-def _row(where: str, value: Any, columns: int) -> np.ndarray:
-    """(column,) float64 from a tensor of that many numbers, with or without a leading axis of 1."""
+def _single_row(location: str, value: Any, columns: int) -> np.ndarray:
+    """(column,) float64 from a tensor of shape (columns,) or (1, columns)."""
     array = np.asarray(value)
-    return checks.table(where, array[None] if array.ndim == 1 else array, columns, rows=1, row="row")[0]
+    return checks.table(location, array[None] if array.ndim == 1 else array, columns, rows=1, row_name="row")[0]
 
 
 def _object(raw: RawTree, key: SequenceKey, kind: str) -> ObjectTrack:
@@ -241,7 +258,7 @@ def _object(raw: RawTree, key: SequenceKey, kind: str) -> ObjectTrack:
     )
 
 
-def _touched(clip: Clip, hands: HandPair) -> tuple[int, int]:
+def _contact_range(clip: Clip, hands: HandPair) -> tuple[int, int]:
     """Half-open range from the first to the last frame with a joint or tip of a hand within 2 cm of the tool."""
     rotation = rotvec_to_rotmat(clip.object.rotvec.astype(np.float64))
     near = np.zeros(clip.n_frames, dtype=bool)

@@ -1,4 +1,4 @@
-"""The conformance check: every built-in adapter and the walk-through's example pass; each kind of mistake is caught."""
+"""Every built-in adapter and the walk-through's example pass the conformance check; it detects each kind of mistake."""
 
 import os
 import subprocess
@@ -41,12 +41,12 @@ def check(adapter, root: Path, **options) -> list[Finding]:
 
 
 def not_passed(findings: list[Finding]) -> dict[str, str]:
-    """Rule -> detail of everything that failed or warned."""
+    """Rule -> detail of each finding that failed or warned."""
     return {item.rule: f"{item.outcome}: {item.detail}" for item in findings if item.outcome in ("fail", "warn")}
 
 
 def changed(example: type, change: Callable[[Clip], Clip]) -> object:
-    """The adapter with a mistake made to every clip."""
+    """The example adapter with ``change`` applied to every clip."""
 
     def load(self, raw: RawTree, key: SequenceKey, hands) -> list:
         return [change(item) for item in example.load(self, raw, key, hands)]
@@ -55,7 +55,7 @@ def changed(example: type, change: Callable[[Clip], Clip]) -> object:
 
 
 def mistaken(example: type, methods: dict) -> object:
-    """An adapter with other methods than the example's; its class lies in this module so that it can be pickled."""
+    """A subclass of the example with other methods; its class is in this module so that it can be pickled."""
     kind = dataclass(frozen=True)(type("MistakenAdapter", (example,), methods | {"__module__": __name__}))
     globals()["MistakenAdapter"] = kind
     return kind()
@@ -102,7 +102,7 @@ def partial_run(site: Path) -> Callable[..., subprocess.CompletedProcess]:
 def test_a_built_in_adapter_keeps_every_rule_on_its_embedded_corpus(name: str, small_corpus) -> None:
     findings = check_adapter(get_adapter(name), small_corpus(name).raw, HANDS)
     assert not_passed(findings) == {}
-    assert {item.rule for item in findings if item.outcome == "skip"} <= {"held objects turn with the hand"}
+    assert {item.rule for item in findings if item.outcome == "skip"} <= {"grasped objects rotate with the hand"}
 
 
 @pytest.mark.long
@@ -112,12 +112,12 @@ def test_manipnet_keeps_every_rule_on_its_recordings_but_shares_one_shape_among_
     assert [item.outcome for item in findings].count("fail") == 0
     shared = {
         "clips stay the same when another sequence is removed",
-        "other sequences go on when a file is cut short",
+        "other sequences convert when a file is cut short",
     }
     assert set(not_passed(findings)) <= shared
 
 
-# Mistakes in what clips hold. Each: the change, and words of the finding it must give.
+# Mistakes in clips: the change, and words of the finding that must report it.
 def transposed(clip: Clip) -> Clip:
     return replace(clip, object=replace(clip.object, rotvec=-clip.object.rotvec))
 
@@ -181,7 +181,10 @@ WRONG_CLIPS: dict[str, tuple[Callable[[Clip], Clip], str]] = {
         "24 frames at 30 per second are 0.77 s, its source frames at 60 0.38 s",
     ),
     "shift of frames": (lambda c: replace(c, source_frames=c.source_frames // 2 * 2 + np.arange(24) % 2), ""),
-    "made frames": (lambda c: replace(c, source_frames=c.source_frames[[*range(9), 8, 8, 8, *range(12, 24)]]), ""),
+    "interpolated frames": (
+        lambda c: replace(c, source_frames=c.source_frames[[*range(9), 8, 8, 8, *range(12, 24)]]),
+        "",
+    ),
     "every frame twice": (
         lambda c: replace(c, source_frames=np.repeat(c.source_frames[::2] // 2, 2)),
         "24 frames at 30 per second are 0.77 s",
@@ -191,33 +194,33 @@ WRONG_CLIPS: dict[str, tuple[Callable[[Clip], Clip], str]] = {
     "gravity": (lambda c: replace(c, gravity=np.array([0.0, -1.0, 0.0])), "up is +z"),
     "no gravity": (lambda c: replace(c, gravity=None), "no gravity, and no note why"),
     "way back": (lambda c: replace(c, source_from_world=np.diag([1.0, 2.0, 1.0, 1.0])), "shears"),
-    "sources": (lambda c: replace(c, sources=()), "clips name the files"),
+    "sources": (lambda c: replace(c, sources=()), "clips name their source files"),
     "half the sources": (lambda c: replace(c, sources=c.sources[1:]), "meshes/cup.obj"),
     "id": (lambda c: replace(c, clip_id=f"kitchen/{next(COUNTER):04d}"), "does not begin with kitchen/"),
     "dataset": (lambda c: replace(c, dataset="cellar"), "its dataset is 'cellar'"),
-    "fitted": (lambda c: replace(c, hands_from="keypoints"), "fit_error_m is to be stated"),
-    "nine betas": (betas(lambda found: found[:, :9]), "betas: expected shape (1, 10), got (1, 9)"),
-    "betas without frames": (betas(lambda found: found[0]), "betas: expected shape (24, 10), got (10,)"),
+    "fitted": (lambda c: replace(c, hands_from="keypoints"), "fit_error_m must be stated"),
+    "nine betas": (betas(lambda values: values[:, :9]), "betas: expected shape (1, 10), got (1, 9)"),
+    "betas without frames": (betas(lambda values: values[0]), "betas: expected shape (24, 10), got (10,)"),
     "NaN": (lambda c: replace(c, object=replace(c.object, rotvec=c.object.rotvec * np.nan)), "finite floats"),
 }
-# One source frame early or late, as where clocks differ; three frames that were put between recorded ones.
-NO_MISTAKE = {"shift of frames", "made frames"}
+# One source frame early or late, as if clocks differ; three interpolated frames between recorded ones.
+NO_MISTAKE = {"shift of frames", "interpolated frames"}
 
 
 @pytest.mark.parametrize("mistake", WRONG_CLIPS)
 def test_a_mistake_in_clips_is_caught(mistake: str, example: type, kitchen_root: Path) -> None:
     change, words = WRONG_CLIPS[mistake]
-    found = not_passed(check(changed(example, change), kitchen_root, sequences=2))
+    problems = not_passed(check(changed(example, change), kitchen_root, sequences=2))
     if mistake in NO_MISTAKE:
-        assert found == {}
+        assert problems == {}
     else:
-        assert words in str(found)
+        assert words in str(problems)
 
 
 @pytest.mark.parametrize(
     ("base", "name", "change", "words"),
     [
-        (H2OAdapter, "h2o", transposed, "held objects turn with the hand"),
+        (H2OAdapter, "h2o", transposed, "grasped objects rotate with the hand"),
         (GrabAdapter, "grab", sides_exchanged, "sides exchanged, or mirrored?"),
         (ArcticAdapter, "arctic", without_mean, "with the mean pose added"),
         (ArcticAdapter, "arctic", transposed, "with object rotations transposed"),
@@ -225,8 +228,8 @@ def test_a_mistake_in_clips_is_caught(mistake: str, example: type, kitchen_root:
 )
 @pytest.mark.slow
 def test_a_wrong_convention_shows_on_the_embedded_corpora(base, name, change, words, small_corpus) -> None:
-    found = not_passed(check(changed(base, change), small_corpus(name).raw, sequences=8))
-    assert words in str(found)
+    problems = not_passed(check(changed(base, change), small_corpus(name).raw, sequences=8))
+    assert words in str(problems)
 
 
 @pytest.mark.slow
@@ -235,11 +238,11 @@ def test_exchanged_parts_of_an_object_show_on_arctic(small_corpus) -> None:
         model = replace(clip.object.model, part=(1 - clip.object.model.part).astype(np.uint8))
         return replace(clip, object=replace(clip.object, model=model))
 
-    found = not_passed(check(changed(ArcticAdapter, exchanged), small_corpus("arctic").raw, sequences=8))
-    assert "with the object's parts exchanged" in str(found)
+    problems = not_passed(check(changed(ArcticAdapter, exchanged), small_corpus("arctic").raw, sequences=8))
+    assert "with the object's parts exchanged" in str(problems)
 
 
-# Mistakes in how files are found and read. Each gives the methods of a class below the example.
+# Mistakes in finding and reading files: each function returns methods for a subclass of the example.
 def unsorted_keys(example: type) -> dict:
     return {"sequences": lambda self, root: example.sequences(self, root)[::-1]}
 
@@ -260,7 +263,7 @@ def numbered_ids(example: type) -> dict:
     return {"load": load}
 
 
-def reading_behind(example: type) -> dict:
+def reading_without_raw(example: type) -> dict:
     def load(self, raw, key, hands) -> list:
         size = len((raw.root / "recordings" / "p02" / "lift_cup_1.json").read_bytes())
         return [replace(clip, gravity_note=str(size)) for clip in example.load(self, raw, key, hands)]
@@ -269,11 +272,11 @@ def reading_behind(example: type) -> dict:
 
 
 def counting(example: type) -> dict:
-    seen = count()
-    return {"load": lambda *given: [replace(c, verb="lift" + "s" * next(seen)) for c in example.load(*given)]}
+    calls = count()
+    return {"load": lambda *arguments: [replace(c, verb="lift" + "s" * next(calls)) for c in example.load(*arguments)]}
 
 
-def naming_the_root(example: type) -> dict:
+def storing_the_root(example: type) -> dict:
     def load(self, raw, key, hands) -> list:
         return [replace(clip, gravity_note=str(raw.root)) for clip in example.load(self, raw, key, hands)]
 
@@ -282,9 +285,9 @@ def naming_the_root(example: type) -> dict:
 
 def raising(make: Callable[[], Exception]) -> Callable[[type], dict]:
     def methods(example: type) -> dict:
-        def load(*given) -> list:
+        def load(*arguments) -> list:
             try:
-                return example.load(*given)
+                return example.load(*arguments)
             except BadInput as error:
                 raise make() from error
 
@@ -293,12 +296,12 @@ def raising(make: Callable[[], Exception]) -> Callable[[type], dict]:
     return methods
 
 
-def giving_text(example: type) -> dict:
-    return {"load": lambda *given: [*example.load(*given), "a clip"]}
+def returning_text(example: type) -> dict:
+    return {"load": lambda *arguments: [*example.load(*arguments), "a clip"]}
 
 
-def finding_nothing(example: type) -> dict:
-    return {"load": lambda *given: []}
+def returning_nothing(example: type) -> dict:
+    return {"load": lambda *arguments: []}
 
 
 @pytest.mark.parametrize(
@@ -307,23 +310,27 @@ def finding_nothing(example: type) -> dict:
         (unsorted_keys, "sequences are sorted, unique and named as they should be", "not sorted"),
         (opening_files, "sequences are found by name: no file is opened", "recordings/p01/lift_cup_1.json is opened"),
         (numbered_ids, "clips stay the same when another sequence is removed", "differs in"),
-        (reading_behind, "files are read through the RawTree only", "recordings/p02/lift_cup_1.json is opened behind"),
+        (
+            reading_without_raw,
+            "files are read through the RawTree only",
+            "recordings/p02/lift_cup_1.json is opened without it",
+        ),
         (counting, "a second run gives the same", "differs in kitchen/p01/lift_cup_1.verb"),
-        (naming_the_root, "a copy of the named source files in another folder gives the same", "gravity_note"),
+        (storing_the_root, "a copy of the named source files in another folder gives the same", "gravity_note"),
         (raising(lambda: KeyError("trans")), "a damaged file raises BadInput, or gives valid clips", "KeyError"),
         (
             raising(lambda: BadInput("a recording", "a good one", "a bad one", "")),
-            "errors name the file and say what was expected, what came and what to do",
+            "errors name the file, the expected and the actual content and a remedy",
             "a recording",
         ),
-        (giving_text, "results are clips or left-out stretches", "kitchen/p01/lift_cup_1: a str"),
-        (finding_nothing, "at least one sequence gives a clip", "everything in it is left out"),
+        (returning_text, "results are clips or quarantined intervals", "kitchen/p01/lift_cup_1: a str"),
+        (returning_nothing, "at least one sequence gives a clip", "it gives no clip"),
     ],
 )
 def test_a_mistake_in_finding_or_reading_files_is_caught(methods, rule, words, example, kitchen_root) -> None:
-    found = not_passed(check(mistaken(example, methods(example)), kitchen_root))
-    assert found[rule].startswith("fail")
-    assert words in found[rule]
+    problems = not_passed(check(mistaken(example, methods(example)), kitchen_root))
+    assert problems[rule].startswith("fail")
+    assert words in problems[rule]
 
 
 @pytest.mark.parametrize(
@@ -347,39 +354,41 @@ def test_conventions_that_exclude_each_other_are_caught(example: type, kitchen_r
     adapter = example()
     convention = replace(adapter.hand_convention, left_shape="unused")
     frame = replace(adapter.frame, up_axis=None)
-    found = str(not_passed(check(replace(adapter, hand_convention=convention, frame=frame), kitchen_root, sequences=1)))
-    assert "they exclude each other" in found
-    assert "not which axis is up" in found
+    problems = str(
+        not_passed(check(replace(adapter, hand_convention=convention, frame=frame), kitchen_root, sequences=1))
+    )
+    assert "they exclude each other" in problems
+    assert "not which axis is up" in problems
 
 
-def test_an_object_that_is_no_adapter_is_told_what_it_lacks() -> None:
-    (found,) = check(object(), Path())
-    assert (found.outcome, "no parts" in found.detail or "no name" in found.detail) == ("fail", True)
+def test_an_object_that_is_not_an_adapter_fails_with_what_it_lacks() -> None:
+    (lacking,) = check(object(), Path())
+    assert (lacking.outcome, "no parts" in lacking.detail or "no name" in lacking.detail) == ("fail", True)
 
 
-def test_the_raw_folder_is_left_as_it_was(example: type, kitchen_root: Path) -> None:
+def test_the_raw_folder_is_unchanged(example: type, kitchen_root: Path) -> None:
     before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in kitchen_root.rglob("*.*")}
     check(example(), kitchen_root)
     assert before == {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in kitchen_root.rglob("*.*")}
 
 
-def turned_about_the_hand(clip: Clip) -> Clip:
-    """A clip of 15 frames whose object turns against the hand that is at it, as a screw cap between fingers."""
+def rotated_against_the_hand(clip: Clip) -> Clip:
+    """A clip of 15 frames whose object rotates against the hand, as a screw cap between fingers."""
     return transposed(clip.take(slice(0, 15)))
 
 
-def test_one_clip_of_fifteen_frames_gets_no_verdict_on_how_its_numbers_are_read(example: type, kitchen_root) -> None:
-    findings = check(changed(example, turned_about_the_hand), kitchen_root, sequences=1)
+def test_one_clip_of_fifteen_frames_gets_no_verdict_on_its_convention(example: type, kitchen_root) -> None:
+    findings = check(changed(example, rotated_against_the_hand), kitchen_root, sequences=1)
     assert not_passed(findings) == {}
-    told = {item.rule: item.detail for item in findings if item.detail.startswith("not decided: ")}
-    assert set(told) == {
-        "wrists are within 0.3 m of the object when it is nearest",
+    undecided = {item.rule: item.detail for item in findings if item.detail.startswith("not decided: ")}
+    assert set(undecided) == {
+        "wrists are within 0.3 m of the object when closest",
         "a fingertip comes within 2 cm of the object in most clips",
         "fingers bend towards the palm: a left hand is a left hand",
-        "no other reading of the numbers brings the fingertips nearer",
-        "held objects turn with the hand",
+        "no other interpretation of the numbers brings the fingertips closer",
+        "grasped objects rotate with the hand",
     }
-    assert told["no other reading of the numbers brings the fingertips nearer"] == (
+    assert undecided["no other interpretation of the numbers brings the fingertips closer"] == (
         "not decided: 15 frames with a hand; 40 are needed, at most 24 of each clip count: load more sequences"
     )
     assert "transposed by 0.0" in str(not_passed(check(changed(example, transposed), kitchen_root, sequences=2)))
@@ -401,17 +410,19 @@ def flat_mesh(clip: Clip) -> Clip:
         (without_hands, "hands are 0.15 to 0.25 m long", "no hand is valid in any frame"),
         (without_hands, "fingers bend towards the palm: a left hand is a left hand", "0 frames of hands"),
         (flat_mesh, "object meshes are not turned inside out (mirrored)", "no mesh encloses 1 %"),
-        (lambda c: c.take(slice(0, 3)), "frames are 1/30 s apart by the source's own clock", "has 3 frames"),
+        (lambda c: c.take(slice(0, 3)), "frames are 1/30 s apart by the source's clock", "has 3 frames"),
     ],
 )
-def test_a_rule_that_cannot_decide_says_so(change, rule: str, why: str, example: type, kitchen_root: Path) -> None:
-    (found,) = (item for item in check(changed(example, change), kitchen_root, sequences=2) if item.rule == rule)
-    assert found.outcome == "skip"
-    assert found.detail.startswith("not decided: ")
-    assert why in found.detail
+def test_a_rule_with_too_little_data_is_reported_as_undecided(
+    change, rule: str, why: str, example: type, kitchen_root: Path
+) -> None:
+    (undecided,) = (item for item in check(changed(example, change), kitchen_root, sequences=2) if item.rule == rule)
+    assert undecided.outcome == "skip"
+    assert undecided.detail.startswith("not decided: ")
+    assert why in undecided.detail
 
 
-def test_rules_about_files_decide_nothing_where_none_was_read_through_the_raw_tree(example, kitchen_root) -> None:
+def test_rules_about_files_are_undecided_if_none_was_read_through_the_raw_tree(example, kitchen_root) -> None:
     def load(self, raw, key, hands) -> list:
         return [replace(clip, sources=()) for clip in example.load(self, RawTree(raw.root), key, hands)]
 
@@ -420,12 +431,12 @@ def test_rules_about_files_decide_nothing_where_none_was_read_through_the_raw_tr
     assert undecided == {
         "files that are read belong to a declared part",
         "a damaged file raises BadInput, or gives valid clips",
-        "errors name the file and say what was expected, what came and what to do",
+        "errors name the file, the expected and the actual content and a remedy",
     }
-    assert "is opened behind its back" in str(not_passed(findings))
+    assert "is opened without it" in str(not_passed(findings))
 
 
-def test_a_difference_is_named_by_its_place(make_clip) -> None:
+def test_a_difference_is_named_by_its_path(make_clip) -> None:
     clip = make_clip()
     assert first_difference((clip,), (make_clip(),)) is None
     other = replace(clip, object=replace(clip.object, rotvec=clip.object.rotvec + 1e-7))

@@ -1,7 +1,7 @@
-"""Conversions that can be killed at a chosen moment. Run as a program it is a server: one JSON order a line.
+"""Conversions that can be killed at a chosen moment. As a program it is a server that reads one JSON order per line.
 
-Each order is a conversion in a forked process group of its own. Its workers import this file anew, so that they too
-die where ``KILL_AT`` says: at the n-th rename, after it, or with half of an array file written.
+Each order is a conversion in a new process group. Its workers import this file, so they also die at the call that
+``KILL_AT`` states: at the n-th rename, after it, or with half of an array file written.
 """
 
 import io
@@ -23,13 +23,13 @@ from hoidata.hands import load_embedded_hands
 
 KILL_AT = "HOIDATA_TEST_KILL_AT"
 LOADED = "HOIDATA_TEST_LOADED"
-DEADLY = "HOIDATA_TEST_DEADLY"  # the name of a sequence that kills whoever converts it
+DEADLY = "HOIDATA_TEST_DEADLY"  # the name of a sequence that kills the process that converts it
 N_FRAMES = 40
-IS_WORKER = __name__ == "__mp_main__"  # how a spawned process names the program it belongs to
+IS_WORKER = __name__ == "__mp_main__"  # the name of the main module in a spawned process
 
 
 def write_grab(root: Path, hands, n_sequences: int, n_frames: int = N_FRAMES, fps: int = 120) -> None:
-    """Sequences of two subjects and two objects in GRAB's format, in turn; the touch begins at frame 12."""
+    """Write alternating sequences of two subjects and two objects in GRAB's format; contact begins at frame 12."""
     write_meshes(root, hands)
     for number in range(n_sequences):
         name = f"s{number % 2 + 1}/{('mug', 'bowl')[number % 2]}_lift_{number:03d}"
@@ -51,7 +51,7 @@ def write_meshes(root: Path, hands) -> None:
 def write_sequence(
     root: Path, name: str, seed: int, n_frames: int = N_FRAMES, fps: int = 120, first_touched: int = 12
 ) -> None:
-    """name: subject/object_intent, as GRAB has it. Numbers are drawn from the seed."""
+    """Write one sequence with random numbers. name: subject/object_intent, as in GRAB."""
     rng, path = np.random.default_rng(seed), root / "grab" / f"{name}.npz"
     mesh, intent = path.stem.split("_")[:2]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -70,7 +70,7 @@ def write_sequence(
 
 @dataclass(frozen=True)
 class LoggedGrab(GrabAdapter):
-    """Writes down each sequence it is asked for, and takes a moment, so that there are moments to die at."""
+    """Logs each sequence it loads, and waits 10 ms so that there is time for a kill."""
 
     def load(self, raw, key, hands):
         with open(os.environ[LOADED], "a") as log:
@@ -82,18 +82,21 @@ class LoggedGrab(GrabAdapter):
 
 
 def die_at(order: dict | None) -> dict[str, int]:
-    """Make this process kill itself, or its whole group, at the n-th call of what the order names; counts the calls.
+    """Make this process kill itself or its group at the n-th call of the operation that the order names.
 
-    at: "rename" before it happens, "renamed" after, "write" with half of an array file written.
+    The operation is "rename" (die before it), "renamed" (die after it) or "write" (die with half of a file written).
+
+    Returns:
+        A dictionary whose entry "count" is the number of calls so far.
     """
-    calls = {"made": 0}
+    calls = {"count": 0}
     if not order or order.get("only") not in (None, "worker" if IS_WORKER else "parent"):
         return calls
     replace, write_arrays = os.replace, arrays_file.write_npz_to
 
     def is_the_one() -> bool:
-        calls["made"] += 1
-        return calls["made"] == order["n"]
+        calls["count"] += 1
+        return calls["count"] == order["n"]
 
     def die() -> None:
         os.killpg(0, signal.SIGKILL) if order["who"] == "group" else os.kill(os.getpid(), signal.SIGKILL)
@@ -128,7 +131,7 @@ if IS_WORKER:
 
 
 def run(order: dict) -> int:
-    """One conversion; the exit code, 1 with the error on stderr."""
+    """Run one conversion. Returns the exit code; on an error 1, with the message on stderr."""
     try:
         convert_dataset(
             LoggedGrab(**order.get("settings", {})),
@@ -147,7 +150,7 @@ def run(order: dict) -> int:
 
 
 def start(order: dict) -> int:
-    """The process id of a new group that runs the order."""
+    """Run the order in a new process group. Returns its id."""
     child = os.fork()
     if child:
         return child
@@ -157,7 +160,7 @@ def start(order: dict) -> int:
     os.environ[DEADLY] = order.get("deadly", "")
     calls = die_at(order.get("kill"))
     code = run(order)
-    Path(order["counted"]).write_text(str(calls["made"]))
+    Path(order["counted"]).write_text(str(calls["count"]))
     os._exit(code)
 
 

@@ -1,4 +1,4 @@
-"""A whole dataset: order, workers, bad sequences, manifests, absent data."""
+"""Conversion of a whole dataset: order, workers, bad sequences, manifests, absent data."""
 
 import hashlib
 import os
@@ -35,10 +35,10 @@ def digests(folder: Path) -> dict[str, str]:
     return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def test_every_sequence_becomes_a_clip_and_the_store_says_where_it_comes_from(root, hands, tmp_path, capsys):
+def test_every_sequence_becomes_a_clip_and_the_store_states_its_origin(root, hands, tmp_path, capsys):
     summary = convert_dataset(GrabAdapter(), root, hands, tmp_path / "clips", synthetic=True)
-    assert (summary.sequences, summary.clips, summary.frames, summary.left_out) == (3, 3, 30, ())
-    assert "grab: 3 clips, 30 frames from 3 sequences; 0 left out" in capsys.readouterr().out
+    assert (summary.sequences, summary.clips, summary.frames, summary.quarantined) == (3, 3, 30, ())
+    assert "grab: 3 clips, 30 frames from 3 sequences; 0 quarantined" in capsys.readouterr().out
     store = open_store(tmp_path / "clips")
     assert store.ids == ["grab/s1/mug_drink_1", "grab/s1/mug_lift", "grab/s2/mug_pass_1"]
     assert store.info["synthetic"]
@@ -49,7 +49,7 @@ def test_every_sequence_becomes_a_clip_and_the_store_says_where_it_comes_from(ro
 
 
 @pytest.mark.slow
-def test_the_number_of_workers_and_the_place_of_the_raw_folder_change_no_byte(root, hands, tmp_path):
+def test_the_number_of_workers_and_the_location_of_the_raw_folder_change_no_byte(root, hands, tmp_path):
     (root / "grab" / "s1" / "mug_lift.npz").write_bytes(b"broken")
     convert_dataset(GrabAdapter(), root, hands, tmp_path / "one", jobs=1, progress=False)
     shutil.move(root, tmp_path / "elsewhere")
@@ -57,18 +57,18 @@ def test_the_number_of_workers_and_the_place_of_the_raw_folder_change_no_byte(ro
     assert digests(tmp_path / "one") == digests(tmp_path / "two")
 
 
-def test_a_bad_sequence_is_left_out_with_its_reason_and_the_others_go_on(root, hands, tmp_path, capsys):
+def test_a_bad_sequence_is_quarantined_with_its_reason_and_the_others_convert(root, hands, tmp_path, capsys):
     path = root / "grab" / "s1" / "mug_lift.npz"
     path.write_bytes(path.read_bytes()[:500])
     summary = convert_dataset(GrabAdapter(), root, hands, tmp_path / "clips")
-    assert (summary.clips, len(summary.left_out)) == (2, 1)
-    assert "1 left out:\n  grab/s1/mug_lift: grab/s1/mug_lift.npz: expected" in capsys.readouterr().out
-    (row,) = open_store(tmp_path / "clips").quarantine.to_dict("records")
-    assert (row["source_key"], row["where"]) == ("grab/s1/mug_lift", "grab/s1/mug_lift.npz")
+    assert (summary.clips, len(summary.quarantined)) == (2, 1)
+    assert "1 quarantined:\n  grab/s1/mug_lift: grab/s1/mug_lift.npz: expected" in capsys.readouterr().out
+    (quarantine_row,) = open_store(tmp_path / "clips").quarantine.to_dict("records")
+    assert (quarantine_row["source_key"], quarantine_row["where"]) == ("grab/s1/mug_lift", "grab/s1/mug_lift.npz")
 
 
 def values_of(value) -> object:
-    """Every number of a clip as bytes with its type and shape, whatever dataclasses it lies in."""
+    """Every number of a clip as bytes with type and shape, through nested dataclasses."""
     if is_dataclass(value):
         return [(item.name, values_of(getattr(value, item.name))) for item in fields(value)]
     if isinstance(value, np.ndarray):
@@ -78,25 +78,25 @@ def values_of(value) -> object:
     return [values_of(item) for item in value] if isinstance(value, tuple) else value
 
 
-# Where a clip's rows lie in the arrays, and the numbers of its files, follow from what else is in the store.
-PLACES = re.compile(r"shard|.*_row|source_files|.*_first|.*_start|.*_template")
+# Positions of a clip in the arrays, and numbers of its files, depend on the other clips of the store.
+POSITION_COLUMNS = re.compile(r"shard|.*_row|source_files|.*_first|.*_start|.*_template")
 
 
 def rows_of(store) -> dict[str, str]:
-    columns = [name for name in store.sequences.columns if not PLACES.fullmatch(name)]
+    columns = [name for name in store.sequences.columns if not POSITION_COLUMNS.fullmatch(name)]
     assert {"n_frames", "object", "verb", "gravity", "source_fps"} <= set(columns)
     rows = store.sequences[columns].to_dict("records")
-    return {row["clip_id"]: repr([np.asarray(value).tolist() for value in row.values()]) for row in rows}
+    return {clip_row["clip_id"]: repr([np.asarray(value).tolist() for value in clip_row.values()]) for clip_row in rows}
 
 
-def test_a_clip_is_the_same_whatever_else_there_is(root, hands, tmp_path):
+def test_a_clip_does_not_depend_on_other_sequences(root, hands, tmp_path):
     convert_dataset(GrabAdapter(), root, hands, tmp_path / "all", progress=False)
     (root / "grab" / "s1" / "mug_drink_1.npz").unlink()
     (root / "grab" / "s1" / "note.txt").write_text("not a sequence")
     convert_dataset(GrabAdapter(), root, hands, tmp_path / "part", progress=False)
     whole, part = open_store(tmp_path / "all"), open_store(tmp_path / "part")
     assert part.ids == ["grab/s1/mug_lift", "grab/s2/mug_pass_1"]
-    assert rows_of(part) == {clip_id: row for clip_id, row in rows_of(whole).items() if clip_id in part.ids}
+    assert rows_of(part) == {clip_id: clip_row for clip_id, clip_row in rows_of(whole).items() if clip_id in part.ids}
     for clip_id in part.ids:
         assert values_of(part.clip(clip_id)) == values_of(whole.clip(clip_id))
         for side in ("left", "right"):
@@ -141,11 +141,11 @@ class CrashingAdapter(GrabAdapter):
         return super().load(raw, key, hands)
 
 
-def test_a_defect_of_an_adapter_is_reported_as_such_and_stops_nothing(root, hands, tmp_path):
+def test_a_defect_of_an_adapter_is_reported_as_such_and_other_sequences_convert(root, hands, tmp_path):
     summary = convert_dataset(CrashingAdapter(), root, hands, tmp_path / "clips", progress=False)
     assert summary.clips == 2
-    assert "index 7 is out of bounds" in summary.left_out[0].got
-    assert "report" in summary.left_out[0].remedy
+    assert "index 7 is out of bounds" in summary.quarantined[0].got
+    assert "report" in summary.quarantined[0].remedy
 
 
 @dataclass(frozen=True)
@@ -157,15 +157,15 @@ class SloppyAdapter(GrabAdapter):
         return [replace(clip, gravity=np.array([0.0, 0.0, -9.81])) for clip in clips] if "lift" in key.name else clips
 
 
-def test_a_clip_that_breaks_a_rule_costs_its_sequence_and_not_the_dataset(root, hands, tmp_path):
+def test_a_clip_that_breaks_a_rule_quarantines_its_sequence_only(root, hands, tmp_path):
     summary = convert_dataset(SloppyAdapter(), root, hands, tmp_path / "clips", progress=False)
     assert summary.clips == 2
-    (item,) = summary.left_out
+    (item,) = summary.quarantined
     assert item.source_key == "grab/s1/mug_lift"
     assert "gravity" in item.where
 
 
-def test_an_absent_dataset_gives_an_empty_store_that_says_why(hands, tmp_path):
+def test_an_absent_dataset_gives_an_empty_store_with_the_reason(hands, tmp_path):
     for number, root in enumerate((None, tmp_path / "nowhere", tmp_path)):
         summary = convert_dataset(GrabAdapter(), root, hands, tmp_path / f"clips{number}", progress=False)
         assert summary.clips == 0
@@ -174,13 +174,13 @@ def test_an_absent_dataset_gives_an_empty_store_that_says_why(hands, tmp_path):
         assert "grab.is.tue.mpg.de" in store.info["empty_reason"]
 
 
-def test_a_file_that_differs_from_the_manifest_or_is_not_in_it_is_left_out(root, hands, tmp_path):
+def test_a_file_that_differs_from_the_manifest_or_is_not_in_it_is_quarantined(root, hands, tmp_path):
     manifest = [item for item in scan_files(root) if item.path != "grab/s2/mug_pass_1.npz"]
     assert convert_dataset(GrabAdapter(), root, hands, tmp_path / "a", manifest=manifest, progress=False).clips == 2
     path = root / "grab" / "s1" / "mug_lift.npz"
     path.write_bytes(path.read_bytes() + b" ")
     summary = convert_dataset(GrabAdapter(), root, hands, tmp_path / "b", manifest=manifest, progress=False)
-    assert [(item.source_key, item.expected.split()[0]) for item in summary.left_out] == [
+    assert [(item.source_key, item.expected.split()[0]) for item in summary.quarantined] == [
         ("grab/s1/mug_lift", "SHA-256"),
         ("grab/s2/mug_pass_1", "a"),
     ]
@@ -224,13 +224,13 @@ def test_a_registered_adapter_declares_its_facts(name, tmp_path):
     assert adapter.sequences(tmp_path) == []
 
 
-def test_an_unknown_adapter_is_answered_with_the_known_ones():
+def test_the_error_for_an_unknown_adapter_lists_the_known_ones():
     assert adapter_names()[:8] == ["arctic", "grab", "h2o", "hoi4d", "hot3d", "manipnet", "oakink2", "taco"]
     with pytest.raises(MissingResource, match="arctic, grab, h2o, hoi4d, hot3d, manipnet, oakink2, taco"):
         get_adapter("tacos")
 
 
-def test_a_key_reads_as_its_dataset_and_name():
+def test_the_text_of_a_key_is_dataset_and_name():
     assert str(SequenceKey("grab", "s1", "s1/mug_lift")) == "grab/s1/mug_lift"
 
 
@@ -262,10 +262,10 @@ def test_a_manifest_scanned_by_parts_lists_every_file_a_conversion_reads(name, h
     assert summary.clips > 0
 
 
-def test_a_generated_store_states_its_own_licence_and_not_the_datasets(root, hands, tmp_path):
-    convert_dataset(GrabAdapter(), root, hands, tmp_path / "made", progress=False, synthetic=True)
+def test_a_generated_store_does_not_state_the_licence_of_the_dataset(root, hands, tmp_path):
+    convert_dataset(GrabAdapter(), root, hands, tmp_path / "generated", progress=False, synthetic=True)
     convert_dataset(GrabAdapter(), root, hands, tmp_path / "real", progress=False)
-    made, real = open_store(tmp_path / "made").info, open_store(tmp_path / "real").info
-    assert made["licence"].startswith("CC0-1.0")
-    assert (made["may_be_shared"], real["may_be_shared"]) == (True, False)
-    assert "no redistribution" in real["licence"]
+    generated, recorded = open_store(tmp_path / "generated").info, open_store(tmp_path / "real").info
+    assert generated["licence"].startswith("CC0-1.0")
+    assert (generated["may_be_shared"], recorded["may_be_shared"]) == (True, False)
+    assert "no redistribution" in recorded["licence"]

@@ -1,4 +1,4 @@
-"""Each adapter gives back, for every clip, the truth the embedded corpus was written from."""
+"""Each adapter recovers, for every clip, the ground truth from which the embedded corpus was written."""
 
 from functools import partial
 
@@ -18,9 +18,9 @@ TOLERANCE = 1e-4  # metres, radians
 @pytest.fixture(scope="module", params=["h2o", "grab", "arctic"])
 def corpus(request, small_corpus):
     """(truths by sequence and first source frame, store) of one dataset's small corpus."""
-    made = small_corpus(request.param)
-    truths = {(truth.source_key, int(truth.source_frames[0])): truth for truth in made.truths}
-    return truths, open_store(made.clips)
+    small = small_corpus(request.param)
+    truths = {(truth.source_key, int(truth.source_frames[0])): truth for truth in small.truths}
+    return truths, open_store(small.clips)
 
 
 @pytest.fixture
@@ -28,8 +28,8 @@ def pairs(corpus):
     truths, store = corpus
     clips = [store.clip(clip_id) for clip_id in store.ids]
     assert {(clip.sequence, int(clip.source_frames[0])) for clip in clips} == set(truths)
-    found = [truths[clip.sequence, int(clip.source_frames[0])] for clip in clips]
-    return [(clip, truth.take(truth.clip_frames)) for clip, truth in zip(clips, found, strict=True)]
+    clip_truths = [truths[clip.sequence, int(clip.source_frames[0])] for clip in clips]
+    return [(clip, truth.take(truth.clip_frames)) for clip, truth in zip(clips, clip_truths, strict=True)]
 
 
 @pytest.mark.slow
@@ -74,12 +74,12 @@ def test_object_pose_and_hinge_are_those_of_the_truth(pairs):
 @pytest.mark.slow
 def test_meshes_parts_and_hinges_are_those_of_the_truth(pairs):
     for clip, truth in pairs:
-        found, expected = clip.object.model, truth.object.model
-        assert found.name == truth.object_name
-        np.testing.assert_allclose(found.vertices_m, expected.vertices_m, atol=1e-6, rtol=0)
-        np.testing.assert_array_equal(found.faces, expected.faces)
-        np.testing.assert_array_equal(found.part, expected.part)
+        model, expected = clip.object.model, truth.object.model
+        assert model.name == truth.object_name
+        np.testing.assert_allclose(model.vertices_m, expected.vertices_m, atol=1e-6, rtol=0)
+        np.testing.assert_array_equal(model.faces, expected.faces)
+        np.testing.assert_array_equal(model.part, expected.part)
         if expected.hinge is not None:
-            assert found.hinge is not None
-            np.testing.assert_allclose(found.hinge.axis, expected.hinge.axis, atol=1e-9)
-            np.testing.assert_allclose(found.hinge.origin_m, expected.hinge.origin_m, atol=1e-9)
+            assert model.hinge is not None
+            np.testing.assert_allclose(model.hinge.axis, expected.hinge.axis, atol=1e-9)
+            np.testing.assert_allclose(model.hinge.origin_m, expected.hinge.origin_m, atol=1e-9)

@@ -1,4 +1,4 @@
-"""Clips kept between runs: every bit of every field comes back, and nothing but parts of clips goes in."""
+"""Packing clips between runs preserves every bit of every field and refuses types that clips do not contain."""
 
 import json
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -15,17 +15,19 @@ from hoidata.conversion.finished import Packer, unpack
 from hoidata.objects.model import ObjectModel
 
 
-def there_and_back(value):
-    kept: dict[str, np.ndarray] = {}
+def round_trip(value):
+    shared_arrays: dict[str, np.ndarray] = {}
 
     def share(array: np.ndarray) -> str:
-        kept[str(len(kept))] = array
-        return str(len(kept) - 1)
+        shared_arrays[str(len(shared_arrays))] = array
+        return str(len(shared_arrays) - 1)
 
     packer = Packer(share)
     text = json.dumps(packer.pack(value))
-    assert packer.shared == set(kept)
-    return unpack(json.loads(text), np.frombuffer(b"".join(packer.blocks), np.uint8), kept.__getitem__), kept
+    assert packer.shared == set(shared_arrays)
+    return unpack(
+        json.loads(text), np.frombuffer(b"".join(packer.blocks), np.uint8), shared_arrays.__getitem__
+    ), shared_arrays
 
 
 def bits(value):
@@ -46,7 +48,13 @@ def full_clip(make_clip) -> Clip:
     return replace(
         clip,
         other_objects=(make_clip(n_frames=7).object,),
-        camera=CameraTrack("cam4", rng.random((7, 3)), rng.random((7, 3)), np.arange(7, dtype=np.int32), rng.random(6)),
+        camera=CameraTrack(
+            name="cam4",
+            rotvec=rng.random((7, 3)),
+            position_m=rng.random((7, 3)),
+            images=np.arange(7, dtype=np.int32),
+            intrinsics=rng.random(6),
+        ),
         body=BodyTrack(rng.random((7, 3)), rng.random((7, 3)), rng.random((7, 63)), rng.random((7, 9))),
         source_contact=SourceContact(np.zeros(3, np.int32), np.arange(3, dtype=np.int32), np.full(3, 22, np.uint8)),
         sources=(SourceFile("s1/mug.npz", 12, "ab" * 32), SourceFile("mug.obj", 1 << 40, "cd" * 32)),
@@ -55,9 +63,13 @@ def full_clip(make_clip) -> Clip:
     )
 
 
-def test_a_clip_comes_back_in_every_bit(make_clip):
-    clips = [full_clip(make_clip), replace(make_clip(), gravity=None), Quarantined("a", "b", "c", "d", "é")]
-    back, _ = there_and_back(clips)
+def test_a_round_trip_preserves_every_bit_of_a_clip(make_clip):
+    clips = [
+        full_clip(make_clip),
+        replace(make_clip(), gravity=None),
+        Quarantined("a", where="b", expected="c", got="d", remedy="é"),
+    ]
+    back, _ = round_trip(clips)
     assert bits(back) == bits(clips)
 
 
@@ -65,9 +77,9 @@ def test_meshes_and_personal_hands_are_shared_and_one_object_only_once(make_clip
     clip = full_clip(make_clip)
     right = replace(clip.hands["right"], template_m=np.random.default_rng(0).random((778, 3)))
     clips = [replace(clip, hands={**clip.hands, "right": right}), clip.take(slice(1, 3)), clip.take(slice(2, 5))]
-    back, kept = there_and_back(clips)
+    back, shared_arrays = round_trip(clips)
     assert bits(back) == bits(clips)
-    assert len(kept) == 3 + 3 + 1  # vertices, faces and parts of two objects; one template
+    assert len(shared_arrays) == 3 + 3 + 1  # vertices, faces and parts of two objects; one template
 
 
 @given(
@@ -76,19 +88,19 @@ def test_meshes_and_personal_hands_are_shared_and_one_object_only_once(make_clip
         arrays.array_shapes(min_dims=0, max_dims=3, min_side=0),
     )
 )
-def test_any_array_of_numbers_comes_back_nan_and_all(array):
-    back, _ = there_and_back([array, array])
+def test_a_round_trip_preserves_any_array_of_numbers_including_nan(array):
+    back, _ = round_trip([array, array])
     assert bits(back) == bits([np.asarray(array)] * 2)
 
 
 @given(st.floats() | st.integers() | st.booleans() | st.text() | st.none() | st.tuples(st.floats(), st.text()))
-def test_plain_values_come_back(value):
-    assert bits(there_and_back(value)[0]) == bits(value)
+def test_a_round_trip_preserves_plain_values(value):
+    assert bits(round_trip(value)[0]) == bits(value)
 
 
-def test_numpy_scalars_stay_what_they_are():
+def test_a_round_trip_preserves_the_type_of_numpy_scalars():
     values = (np.float32(0.1), np.float64(0.1), np.int32(7), np.bool_(True))
-    assert bits(there_and_back(values)[0]) == bits(values)
+    assert bits(round_trip(values)[0]) == bits(values)
 
 
 @dataclass(frozen=True)
@@ -101,6 +113,6 @@ class SpecialModel(ObjectModel):
 
 
 @pytest.mark.parametrize("value", [Tracks(), {1, 2}, np.array([None]), b"bytes", SpecialModel("a", *[np.zeros(1)] * 3)])
-def test_anything_else_is_refused(value):
+def test_other_types_are_refused(value):
     with pytest.raises(TypeError, match="cannot be part of a clip"):
         Packer(lambda array: "").pack(value)

@@ -26,7 +26,7 @@ if __name__ == "__main__":
 
 
 def write_repeated(root: Path, hands, n_sequences: int) -> None:
-    """As many sequences as asked for, the first two linked under further names."""
+    """Write ``n_sequences`` sequences: two files, linked under further names."""
     write_grab(root, hands, 2, FRAMES, 30)
     written = sorted((root / "grab").glob("*/*.npz"))
     for number in range(2, n_sequences):

@@ -1,16 +1,19 @@
-"""Tests of ``AdapterContract``, one for each row and setting of a subclass."""
+"""Parametrizes the tests of ``AdapterContract`` with the file problems and settings of each subclass."""
 
 import pytest
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Every row and setting of a subclass of ``AdapterContract`` is a test of its own."""
+    """One test per file problem and setting of a subclass of ``AdapterContract``."""
     kind = metafunc.cls
-    if "row" in metafunc.fixturenames and hasattr(kind, "rows"):
-        rows = [(row, kind.slow or row.problem == "zip bomb") for row in kind.rows()]
-        marks = {True: pytest.mark.slow, False: ()}
-        metafunc.parametrize("row", [pytest.param(row, id=row.problem, marks=marks[slow]) for row, slow in rows])
-    if "further_row" in metafunc.fixturenames:
-        metafunc.parametrize("further_row", [pytest.param(row, id=row.problem) for row in kind.further_rows()])
+    if "file_problem" in metafunc.fixturenames and hasattr(kind, "file_problems"):
+        params = []
+        for problem in kind.file_problems():
+            is_slow = kind.slow or problem.name == "zip bomb"
+            params.append(pytest.param(problem, id=problem.name, marks=pytest.mark.slow if is_slow else ()))
+        metafunc.parametrize("file_problem", params)
+    if "format_problem" in metafunc.fixturenames:
+        problems = [pytest.param(problem, id=problem.name) for problem in kind.format_problems()]
+        metafunc.parametrize("format_problem", problems)
     if "setting" in metafunc.fixturenames and hasattr(kind, "bad_settings"):
         metafunc.parametrize("setting", list(kind.bad_settings))

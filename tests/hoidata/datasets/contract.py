@@ -1,4 +1,4 @@
-"""What every adapter promises, whatever its dataset: one class, subclassed once per dataset with a small raw tree."""
+"""Tests that every adapter must pass: one class, subclassed once per dataset with a small raw tree."""
 
 import hashlib
 import re
@@ -22,49 +22,46 @@ from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
 from hoidata.splits.definitions import definitions_for, published
 from hoidata.store.store import open_store
+from tests.builders.corruption import CANARY, Corrupt
 from tests.builders.formulas import has_its_own_side, seated_person, sits_as_described
-from tests.builders.spoilt import CANARY, Spoil
 
 HERE = Path(__file__).parent
 
 
-class Row(NamedTuple):
-    """One way to spoil a file. where: what the error must name; says: words of the error."""
+class FileProblem(NamedTuple):
+    """A way to corrupt a file, and the error it must cause."""
 
-    problem: str
-    where: str
-    spoil: Spoil
-    says: str
+    name: str
+    location: str  # part of the error's location
+    corrupt: Corrupt
+    message: str  # part of the error's text
 
 
 class AdapterContract:
-    """name: of the dataset. spoilt: the sequence of ``write``'s two whose files the rows spoil.
+    """Tests of one adapter. A subclass sets the class variables and implements ``write`` and ``file_problems``."""
 
-    bad_settings: name -> (value, what is expected). conventions: row of ``CONVENTIONS.md`` -> the test that fails when
-    it is flipped, in test_conventions.py beside the subclass unless a path below this folder is given.
-    slow: rows take seconds each. common_sources: clips of one sequence list files of all as their sources.
-    """
-
-    name: ClassVar[str]
-    spoilt: ClassVar[str]
-    bad_settings: ClassVar[Mapping[str, tuple[Any, str]]]
+    name: ClassVar[str]  # of the dataset
+    corrupted_sequence: ClassVar[str]  # the sequence of ``write`` whose files the problems corrupt
+    bad_settings: ClassVar[Mapping[str, tuple[Any, str]]]  # by name: a bad value, and words of the error
+    # Test that fails when a convention is flipped, by row of CONVENTIONS.md: its name in test_conventions.py of the
+    # dataset, or ``path::name`` with a path below this folder.
     conventions: ClassVar[Mapping[str, str]]
-    slow: ClassVar[bool] = False
-    common_sources: ClassVar[bool] = False
+    slow: ClassVar[bool] = False  # each file problem takes seconds
+    common_sources: ClassVar[bool] = False  # clips of one sequence have files of other sequences as sources
 
     @staticmethod
     def write(root: Path) -> object:
-        """A raw tree of two sequences, each with an object of its own."""
+        """Write a raw tree of two sequences with different objects."""
         raise NotImplementedError
 
     @staticmethod
-    def rows() -> Iterable[Row]:
-        """Problems of ``hoidata/files/README.md``'s table, tried through a whole conversion."""
+    def file_problems() -> Iterable[FileProblem]:
+        """Problems of the table in ``hoidata/files/README.md``, tested through a whole conversion."""
         raise NotImplementedError
 
     @staticmethod
-    def further_rows() -> Iterable[Row]:
-        """Problems of this format alone, tried on the one sequence."""
+    def format_problems() -> Iterable[FileProblem]:
+        """Problems of this format alone, tested on one sequence."""
         return ()
 
     @pytest.fixture(scope="class")
@@ -75,8 +72,8 @@ class AdapterContract:
         (folder / "raw").mkdir()
         cls.write(folder / "raw")
         whole, left_out = cls.converted(folder / "raw", folder / "whole")
-        assert not [item for item in left_out if item.source_key.startswith(cls.spoilt)]
-        assert len({clip_id.startswith(cls.spoilt) for clip_id in whole}) == 2
+        assert not [item for item in left_out if item.source_key.startswith(cls.corrupted_sequence)]
+        assert len({clip_id.startswith(cls.corrupted_sequence) for clip_id in whole}) == 2
         return folder / "raw", whole
 
     @pytest.fixture
@@ -87,28 +84,28 @@ class AdapterContract:
 
     @classmethod
     def converted(cls, root: Path, out: Path) -> tuple[dict[str, str], tuple[Quarantined, ...]]:
-        """Fingerprint of each clip by id, and what was left out."""
+        """Fingerprint of each clip by id, and the quarantined sequences."""
         summary = convert_dataset(get_adapter(cls.name), root, load_embedded_hands(), out, progress=False)
         store = open_store(out)
         clips = {clip_id: store.clip(clip_id) for clip_id in store.ids}
         if cls.common_sources:
             clips = {clip_id: replace(clip, sources=()) for clip_id, clip in clips.items()}
-        return {clip_id: fingerprint(clip) for clip_id, clip in clips.items()}, summary.left_out
+        return {clip_id: fingerprint(clip) for clip_id, clip in clips.items()}, summary.quarantined
 
     def load(self, raw: RawTree) -> list[Clip | Quarantined]:
-        """The results of the sequence the rows spoil."""
+        """The results of the sequence that the problems corrupt."""
         adapter = get_adapter(self.name)
-        (key,) = (key for key in adapter.sequences(raw.root) if str(key) == self.spoilt)
+        (key,) = (key for key in adapter.sequences(raw.root) if str(key) == self.corrupted_sequence)
         return adapter.load(raw, key, load_embedded_hands())
 
     @pytest.mark.slow
-    def test_it_keeps_every_rule_of_the_conformance_check(self, root: Path) -> None:
-        """Hands of these trees touch nothing, so warnings about touch are of no account."""
+    def test_it_passes_every_rule_of_the_conformance_check(self, root: Path) -> None:
+        """Hands of these trees touch nothing, so warnings are ignored."""
         findings = check_adapter(get_adapter(self.name), root, load_embedded_hands(), worker=False)
         assert [item for item in findings if item.outcome == "fail"] == []
         assert [item.rule for item in findings if item.outcome == "pass"]
 
-    def test_its_facts_stand_in_its_folder_and_nowhere_else(self) -> None:
+    def test_its_facts_are_in_its_folder_and_nowhere_else(self) -> None:
         folder, facts = dataset_folder(self.name), dataset_facts(self.name)
         assert folder
         assert facts == get_adapter(self.name).facts  # type: ignore[attr-defined]
@@ -120,12 +117,12 @@ class AdapterContract:
         facts = dataset_facts(self.name)
         assert facts
         assert set(facts.conventions) == set(self.conventions)
-        for place in self.conventions.values():
-            file, _, test = place.rpartition("::")
+        for test_path in self.conventions.values():
+            file, _, test = test_path.rpartition("::")
             path = HERE / (file or f"{self.name}/test_conventions.py")
-            assert re.search(rf"def {test}\(", path.read_text()), place
+            assert re.search(rf"def {test}\(", path.read_text()), test_path
 
-    def test_a_setting_that_means_nothing_is_refused(self, setting: str) -> None:
+    def test_a_bad_setting_is_refused(self, setting: str) -> None:
         value, expected = self.bad_settings[setting]
         with pytest.raises(BadInput, match=rf"settings of the adapter {self.name}: {setting}: expected .*{expected}"):
             get_adapter(self.name, **{setting: value})
@@ -136,7 +133,7 @@ class AdapterContract:
         assert any(holds)
         assert not all(holds)
 
-    def test_a_file_that_is_not_as_its_manifest_says_is_refused(self, root: Path) -> None:
+    def test_a_file_that_differs_from_its_manifest_is_refused(self, root: Path) -> None:
         raw = RawTree(root)
         self.load(raw)
         listed = {source.path: source for source in raw.sources}
@@ -148,37 +145,44 @@ class AdapterContract:
                     self.load(RawTree(root, {name: changed[name] for name in manifest}))
                 assert caught.value.where.startswith(path)
 
-    def test_a_spoilt_file_costs_its_sequence_and_nothing_else(self, row: Row, intact, root, tmp_path: Path) -> None:
-        row.spoil(root)
+    def test_a_corrupted_file_quarantines_its_sequence_only(
+        self, file_problem: FileProblem, intact, root, tmp_path: Path
+    ) -> None:
+        file_problem.corrupt(root)
         clips, left_out = self.converted(root, tmp_path / "store")
         assert not CANARY.exists()
-        found = [item for item in left_out if item.source_key.startswith(self.spoilt)]
-        assert found, f"not left out: {left_out}"
-        text = f"{found[0].where}: expected {found[0].expected}, got {found[0].got}; {found[0].remedy}"
-        assert row.where in found[0].where, text
-        assert row.says in text
+        result = [item for item in left_out if item.source_key.startswith(self.corrupted_sequence)]
+        assert result, f"not left out: {left_out}"
+        text = f"{result[0].where}: expected {result[0].expected}, got {result[0].got}; {result[0].remedy}"
+        assert file_problem.location in result[0].where, text
+        assert file_problem.message in text
         assert "defect of hoidata" not in text
-        assert all((found[0].expected, found[0].got, found[0].remedy))
-        assert clips == {name: digest for name, digest in intact[1].items() if not name.startswith(self.spoilt)}
+        assert all((result[0].expected, result[0].got, result[0].remedy))
+        assert clips == {
+            name: digest for name, digest in intact[1].items() if not name.startswith(self.corrupted_sequence)
+        }
 
-    def test_a_bad_file_is_named_with_what_was_expected(self, further_row: Row, root: Path) -> None:
-        further_row.spoil(root)
+    def test_the_error_for_a_bad_file_names_it_and_the_expected_content(
+        self, format_problem: FileProblem, root: Path
+    ) -> None:
+        format_problem.corrupt(root)
         with pytest.raises(BadInput) as caught:
             self.load(RawTree(root))
         assert not CANARY.exists()
-        assert further_row.where in caught.value.where
-        assert further_row.says in str(caught.value)
+        assert format_problem.location in caught.value.where
+        assert format_problem.message in str(caught.value)
 
 
 class SeatedPersonContract:
-    """Numbers of a known person, and of her mirror image, as a source would write them.
+    """Tests that an adapter does not mirror the world, with a person of known pose and the mirror image.
 
-    A subclass has the fixture ``look``: of a ``seated_person`` the joints of both hands and three edges in the world.
+    A subclass has the fixture ``look``: it maps a ``seated_person`` to joints of both hands and three edges in the
+    world.
     """
 
     edges_seen = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
 
-    def test_each_hands_numbers_bend_a_hand_of_that_side(self, look):
+    def test_the_numbers_of_each_hand_bend_a_hand_of_that_side(self, look):
         assert has_its_own_side(look(seated_person())[0])
         assert not has_its_own_side(look(seated_person(swapped=True))[0])
 
@@ -189,7 +193,7 @@ class SeatedPersonContract:
 
 
 def fingerprint(value: Any) -> str:
-    """A digest of all that a clip holds."""
+    """A digest of all fields of a clip."""
     digest = hashlib.sha256()
 
     def visit(item: Any) -> None:

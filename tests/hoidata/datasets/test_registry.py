@@ -1,6 +1,6 @@
-"""Built-in adapters and those of other packages: found by entry point, listed with their origin, settings checked.
+"""The registry finds built-in adapters and those of other packages, lists their origin and checks their settings.
 
-Also the tables made of all datasets: conventions from their facts, problems of input from their contracts.
+Also the generated table of conventions, and the imports between dataset packages.
 """
 
 import importlib
@@ -31,7 +31,7 @@ from tests.hoidata.datasets.taco.test_contract import TestTaco as Taco
 
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Make it look as if a package registered an adapter: metadata in a folder of ``sys.path``."""
+    """Simulate an installed package that registers an adapter: its metadata is in a folder of ``sys.path``."""
 
     def write(package: str, adapter: str, target: str) -> None:
         folder = tmp_path / package / f"{package}-3.1.dist-info"
@@ -44,7 +44,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     return write
 
 
-def row(name: str):
+def registered(name: str):
     return next(item for item in registered_adapters() if item.name == name)
 
 
@@ -52,11 +52,11 @@ def test_an_adapter_of_another_package_is_found_after_the_built_in_ones(install)
     install("attic", "attic", "hoidata.datasets.grab.adapter:GrabAdapter")
     assert adapter_names() == [*built_in_names(), "attic"]
     assert get_adapter("attic", margin_frames=4) == GrabAdapter(margin_frames=4)
-    assert row("attic").origin == "attic 3.1"
-    assert row("grab").origin == "built in"
+    assert registered("attic").origin == "attic 3.1"
+    assert registered("grab").origin == "built in"
 
 
-def test_a_package_cannot_take_the_place_of_a_built_in_adapter(install) -> None:
+def test_a_package_cannot_replace_a_built_in_adapter(install) -> None:
     install("impostor", "grab", "hoidata.datasets.h2o.adapter:H2OAdapter")
     assert isinstance(get_adapter("grab"), GrabAdapter)
     assert adapter_names() == built_in_names()
@@ -66,8 +66,8 @@ def test_a_package_that_cannot_be_imported_is_named_and_hides_no_other(install) 
     install("broken", "attic", "no_such_module:Adapter")
     with pytest.raises(MissingResource, match=r"'attic' of broken 3.1 cannot be imported: ModuleNotFoundError"):
         get_adapter("attic")
-    assert "no_such_module" in row("attic").problem
-    assert isinstance(row("h2o").adapter, Adapter)
+    assert "no_such_module" in registered("attic").problem
+    assert isinstance(registered("h2o").adapter, Adapter)
 
 
 def test_two_packages_with_one_name_are_both_named(install) -> None:
@@ -78,33 +78,40 @@ def test_two_packages_with_one_name_are_both_named(install) -> None:
     assert adapter_names().count("attic") == 1
 
 
-def test_settings_are_the_fields_that_are_no_facts() -> None:
-    assert row("grab").settings["margin_frames"] == 0
-    assert not set(row("grab").settings) & set(FACTS)
+def test_settings_are_the_fields_that_are_not_facts() -> None:
+    assert registered("grab").settings["margin_frames"] == 0
+    assert not set(registered("grab").settings) & set(FACTS)
     with pytest.raises(BadInput, match=r"margin_frames.*got licence"):
         get_adapter("grab", licence="mine")
 
 
-def test_every_built_in_adapter_has_a_margin() -> None:
-    assert all("margin_frames" in row(name).settings for name in built_in_names())
+def test_every_built_in_adapter_has_the_setting_margin_frames() -> None:
+    """``convert.margin_frames`` in params.yaml is passed to the adapter of every dataset."""
+    lacking = [name for name in built_in_names() if "margin_frames" not in registered(name).settings]
+    assert not lacking, (
+        f"add the field `margin_frames: int = 0` to the adapter of {', '.join(lacking)}: `convert.margin_frames` in "
+        "params.yaml sets it for every dataset (frames at 30 fps that a clip keeps before and after its interaction; "
+        "see 'Settings' in hoidata/datasets/README.md)"
+    )
 
 
 CONTRACTS: tuple[type[AdapterContract], ...] = (OfH2O, Grab, Arctic, ManipNet, Taco, Hoi4d, Hot3d, Oakink2)
-ROOM = Path(hoidata.datasets.__file__).parent
+PACKAGE = Path(hoidata.datasets.__file__).parent
 
 
-def test_every_built_in_dataset_is_under_contract() -> None:
-    assert sorted(kind.name for kind in CONTRACTS) == built_in_names()
+def test_every_built_in_dataset_has_a_contract_test() -> None:
+    hint = "list the subclass of AdapterContract of every dataset in CONTRACTS"
+    assert sorted(kind.name for kind in CONTRACTS) == built_in_names(), hint
 
 
-def test_the_committed_table_of_conventions_is_made_of_the_facts() -> None:
+def test_the_committed_table_of_conventions_is_generated_from_the_facts() -> None:
     hint = "run: python -m hoidata.datasets.convention_table > hoidata/datasets/CONVENTIONS.md"
-    assert (ROOM / "CONVENTIONS.md").read_text() == table(), hint
+    assert (PACKAGE / "CONVENTIONS.md").read_text() == table(), hint
     assert sum(len(kind.conventions) for kind in CONTRACTS) >= 60
 
 
 def test_no_dataset_imports_another_and_the_shared_code_imports_none() -> None:
-    for path in (ROOM.parent / "dataset_folders.py", *ROOM.rglob("*.py")):
-        owner = path.parent.name if path.parent.parent == ROOM else ""
+    for path in (PACKAGE.parent / "dataset_folders.py", *PACKAGE.rglob("*.py")):
+        owner = path.parent.name if path.parent.parent == PACKAGE else ""
         named = set(re.findall(r"hoidata\.datasets\.(\w+)", path.read_text())) & set(built_in_names())
         assert named <= {owner}, path

@@ -14,7 +14,7 @@ from hoidata.datasets.arctic.files import parse_parts
 from hoidata.datasets.base import RawTree
 from hoidata.datasets.checks import table
 from hoidata.datasets.h2o.files import listed_segments
-from hoidata.datasets.hot3d.files import LARGEST_ROWS, POSE_COLUMNS, hand_poses, object_poses
+from hoidata.datasets.hot3d.files import MAX_TABLE_BYTES, POSE_COLUMNS, hand_poses, object_poses
 from hoidata.datasets.manipnet.adapter import _read_tips
 from hoidata.datasets.manipnet.hand import ROOT_CHANNELS, parse_bvh, unpack_text
 from hoidata.files.numpy_files import load_npz_arrays, load_npz_objects
@@ -215,12 +215,12 @@ def listed(path: Path) -> Any:
 
 def hand_lines() -> bytes:
     line = b'{"timestamp_ns": 1, "hand_poses": {}}\n'
-    return line * (LARGEST_ROWS // len(line))
+    return line * (MAX_TABLE_BYTES // len(line))
 
 
 def object_rows() -> bytes:
     head = ",".join(POSE_COLUMNS).encode() + b"\n"
-    return head + b"1,1,0,0,0,1,0,0,0\n" * (LARGEST_ROWS // 18 - 10)
+    return head + b"1,1,0,0,0,1,0,0,0\n" * (MAX_TABLE_BYTES // 18 - 10)
 
 
 def as_hand_reference(path: Path) -> Any:

@@ -117,7 +117,7 @@ def test_a_link_that_leads_back_does_not_make_a_scan_endless(raw):
 
 def test_missing_parts_are_named_required_ones_first(raw):
     adapter = SimpleNamespace(parts=PARTS)
-    assert [part.what for part in missing_parts(adapter, raw)] == ["meshes", "tables"]
+    assert [part.contents for part in missing_parts(adapter, raw)] == ["meshes", "tables"]
     assert part_of(adapter, "s3/cup.npz") is PARTS[1]
     assert part_of(adapter, "cam4/obj_pose_rt") is PARTS[0]
     assert part_of(adapter, "s3/deep/cup.npz") is None

@@ -42,7 +42,7 @@ def test_a_subject_that_misc_json_lacks_has_images_numbered_like_frames(root, lo
     assert first(load_all, root).camera.images[0] == 0
 
 
-def test_the_body_is_left_out_until_it_is_asked_for(root, load_all):
+def test_the_body_is_included_on_request_only(root, load_all):
     recording.write_extra(root, "smplx", recording.body())
     assert first(load_all, root).body is None
     clip = load_all(ArcticAdapter(body=True), root)[1]
@@ -117,7 +117,7 @@ def test_espressomachine_has_no_description_and_is_used_as_a_whole(root, load_al
     assert "espressomachine" in caught.value.remedy
 
 
-def test_sequences_without_a_description_can_be_whole_beside_described_ones(root, load_all):
+def test_sequences_without_a_description_can_be_whole_next_to_described_ones(root, load_all):
     described = load_all(ArcticAdapter(), root)
     recording.write_sequence(root, "espressomachine_use_01")
     recording.write_template(root, "espressomachine")
@@ -136,10 +136,10 @@ def test_the_test_subject_whose_motion_is_withheld_is_named_as_such(root, hands,
     assert source.is_dir()
     out = tmp_path_factory.mktemp("store") / "clips"
     summary = convert_dataset(ArcticAdapter(clips=clips), root, hands, out, progress=False)
-    (row,) = summary.left_out
-    assert row.source_key == "arctic/s03/box_grab_01"
-    assert "withholds the motion of its test subject s03" in row.got
-    assert row.remedy.startswith("nothing to do")
+    (quarantined,) = summary.quarantined
+    assert quarantined.source_key == "arctic/s03/box_grab_01"
+    assert "withholds the motion of its test subject s03" in quarantined.got
+    assert quarantined.remedy.startswith("nothing to do")
     assert summary.clips == {"described": 4, "whole": 1}[clips]
 
 
@@ -151,14 +151,14 @@ def test_a_withheld_sequence_someone_does_have_converts_like_any_other(root, loa
 
 @pytest.mark.parametrize("top", ["data", "arctic_data/data"])
 def test_the_folders_may_lie_below_data(root, load_all, tmp_path_factory, top):
-    there = tmp_path_factory.mktemp("download")
-    shutil.copytree(root, there / top)
-    assert [clip.clip_id for clip in load_all(ArcticAdapter(), there)] == [
+    download = tmp_path_factory.mktemp("download")
+    shutil.copytree(root, download / top)
+    assert [clip.clip_id for clip in load_all(ArcticAdapter(), download)] == [
         clip.clip_id for clip in load_all(ArcticAdapter(), root)
     ]
-    (there / top / "raw_seqs/s04/box_grab_01.mano.npy").unlink()
+    (download / top / "raw_seqs/s04/box_grab_01.mano.npy").unlink()
     with pytest.raises(BadInput) as caught:
-        load_all(ArcticAdapter(), there)
+        load_all(ArcticAdapter(), download)
     assert caught.value.where == f"{top}/raw_seqs/s04/box_grab_01.mano.npy"
 
 
@@ -212,7 +212,7 @@ LINES = """1-40 grasp, left hand
 21-60 lift, left hand
 """
 HELD, OPENED, LIFTED = (f"arctic/s04/box_use_01/{name}" for name in ("0001-0040", "0021-0060-right", "0021-0060-left"))
-NEAR_M = 0.4  # both hands of the recording are nearer to its box in every range
+NEAR_M = 0.4  # both hands are closer than this to the box in each range
 
 
 @pytest.fixture
@@ -231,7 +231,7 @@ def annotated(tmp_path, load_clips):
     return by_rule
 
 
-def test_each_line_is_a_clip_of_its_own_range_with_its_own_hand_and_sentence(annotated):
+def test_each_line_is_a_clip_with_the_range_hand_and_sentence_of_the_line(annotated):
     store = annotated("annotated-else-proximity")
     assert {key: store.sentences(key)[0] for key in store.ids()} == {
         HELD: "Grasp a box with the left hand.",
@@ -239,14 +239,14 @@ def test_each_line_is_a_clip_of_its_own_range_with_its_own_hand_and_sentence(ann
         LIFTED: "Lift a box with the left hand.",
     }
     frames = {key: store.clip(key).source_frames for key in store.ids()}
-    assert {key: (int(found[0]), int(found[-1])) for key, found in frames.items()} == {
+    assert {key: (int(result[0]), int(result[-1])) for key, result in frames.items()} == {
         HELD: (0, 39),
         OPENED: (20, 59),
         LIFTED: (20, 59),
     }
 
 
-def test_by_distance_both_hands_of_such_a_clip_are_active_and_the_annotators_is_kept_beside(annotated):
+def test_both_hands_of_such_a_clip_are_active_by_distance_and_the_annotated_hand_is_stored_too(annotated):
     store = annotated("proximity")
     assert set(store.hand_types["hand_type"]) == {"both"}
     assert store.hand_types["labelled_hand"].to_dict() == {HELD: "left", OPENED: "right", LIFTED: "left"}
@@ -296,7 +296,7 @@ def test_parts_may_be_json_booleans(root, load_all, lift):
 @pytest.mark.parametrize(
     ("verb", "noun"), [("write", "notebook"), ("operate", "waffleiron"), ("push", "capsulemachine")]
 )
-def test_the_verb_object_pairs_that_text2hoi_left_out_give_no_clip(root, load_clips, verb, noun):
+def test_the_verb_object_pairs_that_text2hoi_excludes_give_no_clip(root, load_clips, verb, noun):
     lines = f"1-40 {verb}, right hand\n20-60 open, left hand\n"
     recording.write_sequence(root, f"{noun}_use_02", lines)
     recording.write_template(root, noun)
@@ -311,8 +311,8 @@ def test_a_pair_text2hoi_leaves_out_is_listed_with_its_reason_and_kept_when_aske
     (item,) = [item for item in load_all(ArcticAdapter(), root) if "notebook" in str(item)]
     assert (item.source_key, item.got) == ("arctic/s04/notebook_use_02/0001-0040", "write notebook")
     assert "all_pairs" in item.remedy
-    kept = [clip.verb for clip in load_clips(ArcticAdapter(all_pairs=True), root) if "notebook" in clip.clip_id]
-    assert kept == ["write"]
+    verbs = [clip.verb for clip in load_clips(ArcticAdapter(all_pairs=True), root) if "notebook" in clip.clip_id]
+    assert verbs == ["write"]
 
 
 def test_a_range_of_19_frames_is_listed_with_its_reason(root, load_all):
@@ -326,7 +326,7 @@ def test_a_range_of_19_frames_is_listed_with_its_reason(root, load_all):
     assert long.n_frames == 20
 
 
-def test_a_range_that_ends_one_frame_after_the_motion_is_left_out_and_not_cut_short(root, load_all):
+def test_a_range_that_ends_one_frame_after_the_motion_is_rejected_and_not_shortened(root, load_all):
     recording.write_sequence(root, "box_use_02", "21-70 open, left hand\n31-71 close, left hand\n")
     whole, beyond = [item for item in load_all(ArcticAdapter(), root) if "box_use_02" in str(item)]
     assert whole.source_frames.tolist() == list(range(20, 70))

@@ -1,6 +1,6 @@
-"""ARCTIC's conventions, one test each: numbers typed by hand, formulas of the publication, and the same with the
-convention the other way round, which must be off by more than 5 mm (or by a frame). Neither our writer nor our engine
-is used."""
+"""ARCTIC's conventions, one test each: literal numbers, formulas of the publication, and the same with the flipped
+convention, which must be off by more than 5 mm (or by a frame). The formulas use neither a builder nor hoidata's code.
+"""
 
 import json
 from dataclasses import replace
@@ -19,7 +19,7 @@ from tests.builders.arctic import BOTTOM_MM, SHAPE, STORED, TOP_MM
 from tests.builders.formulas import EXACT_M, WRONG_M, agrees, chain, joints_as_stored, off_m, rest_points
 from tests.hoidata.datasets.contract import SeatedPersonContract
 
-AT = 30  # the frame that is looked at
+AT = 30  # the tested frame
 ANGLE, OBJECT_ORIENT, OBJECT_MM = (array[AT] for array in (recording.ANGLE, recording.ORIENT, recording.TRANSLATION_MM))
 ORIENT, TRANS = recording.HAND_ORIENT, recording.HAND_TRANSL
 HEAD = recording.head()
@@ -49,12 +49,12 @@ def absolute(hands, side: str) -> np.ndarray:
 
 
 def hand_joints(clip, side: str, hands) -> np.ndarray:
-    """(16, 3) joints of the frame looked at, from what the clip says."""
+    """(16, 3) joints of the tested frame, from the clip."""
     return joints_as_stored(clip.hands[side], hands[side], at(clip))
 
 
 def arctic_joints(side: str, hands, bends=None, betas=None) -> np.ndarray:
-    """(16, 3) joints as ARCTIC means its numbers: betas, bends that gain the mean, turned about J0, then moved."""
+    """(16, 3) joints by ARCTIC's convention: betas, angles plus mean pose, rotated about J0, then translated."""
     rest = rest_points(hands[side], SHAPE[side] if betas is None else betas)
     return chain(rest, ORIENT[side], absolute(hands, side) if bends is None else bends, TRANS[side])
 
@@ -62,36 +62,36 @@ def arctic_joints(side: str, hands, bends=None, betas=None) -> np.ndarray:
 @pytest.mark.parametrize("side", ["left", "right"])
 class TestHands:
     def test_fingers_are_relative_to_the_mean_pose(self, clip, hands, side):
-        meant = Rotation.from_rotvec(absolute(hands, side).reshape(15, 3)).as_rotvec()  # of at most pi, as it is stored
+        meant = Rotation.from_rotvec(absolute(hands, side).reshape(15, 3)).as_rotvec()  # of at most pi, as in the store
         np.testing.assert_allclose(clip.hands[side].hand_pose[at(clip)], meant.ravel(), atol=EXACT_M)
-        found = hand_joints(clip, side, hands)
-        agrees(found, arctic_joints(side, hands), arctic_joints(side, hands, bends=np.array(STORED)))
+        actual = hand_joints(clip, side, hands)
+        agrees(actual, arctic_joints(side, hands), arctic_joints(side, hands, bends=np.array(STORED)))
 
     def test_angles_beyond_pi_gain_the_mean_as_they_are(self, clip, hands, side):
-        found = hand_joints(clip, side, hands)
+        actual = hand_joints(clip, side, hands)
         wrapped = Rotation.from_rotvec(np.reshape(STORED, (15, 3))).as_rotvec().ravel()
         assert np.abs(wrapped - STORED).max() > 1
-        agrees(found, arctic_joints(side, hands), arctic_joints(side, hands, bends=wrapped + hands[side].mean_pose))
+        agrees(actual, arctic_joints(side, hands), arctic_joints(side, hands, bends=wrapped + hands[side].mean_pose))
 
-    def test_the_hand_turns_about_its_shaped_rest_wrist_and_is_moved_by_trans(self, clip, hands, side):
+    def test_the_hand_rotates_about_its_shaped_rest_wrist_and_is_moved_by_trans(self, clip, hands, side):
         rest = rest_points(hands[side], SHAPE[side])
-        found = hand_joints(clip, side, hands)
+        actual = hand_joints(clip, side, hands)
         assert off_m(clip.hands[side].wrist_m[at(clip)], rest[0] + TRANS[side]) < EXACT_M
-        assert off_m(found, arctic_joints(side, hands) - rest[0]) > WRONG_M
+        assert off_m(actual, arctic_joints(side, hands) - rest[0]) > WRONG_M
         about_origin = Rotation.from_rotvec(ORIENT[side]).apply(rest[0]) + TRANS[side]
         assert off_m(clip.hands[side].wrist_m[at(clip)], about_origin) > WRONG_M
 
     def test_one_row_of_betas_holds_for_the_whole_sequence(self, clip, hands, side):
         np.testing.assert_allclose(clip.hands[side].betas, [SHAPE[side]], atol=EXACT_M)
-        found = hand_joints(clip, side, hands)
-        agrees(found, arctic_joints(side, hands), arctic_joints(side, hands, betas=np.zeros(10)))
+        actual = hand_joints(clip, side, hands)
+        agrees(actual, arctic_joints(side, hands), arctic_joints(side, hands, betas=np.zeros(10)))
 
 
 def test_left_betas_belong_to_the_shape_directions_as_mano_released_them(tmp_path):
     """A pair like MANO's: x of the left shape directions has the right hand's sign."""
     hands = load_embedded_hands()
     right_directions = hands.right.shape_directions.copy()
-    right_directions[:, 0, 0] += 0.003  # one beta that moves the wrist, too
+    right_directions[:, 0, 0] += 0.003  # one beta that also moves the wrist
     left_directions = hands.left.shape_directions.copy()
     left_directions[:, 0] = right_directions[:, 0]
     released = HandPair(
@@ -103,17 +103,17 @@ def test_left_betas_belong_to_the_shape_directions_as_mano_released_them(tmp_pat
     adapter, raw = ArcticAdapter(), RawTree(write(tmp_path))
     used = hands_for(adapter.hand_convention, released)
     (clip,) = adapter.load(raw, adapter.sequences(raw.root)[0], used)
-    found = hand_joints(clip, "left", used)
+    actual = hand_joints(clip, "left", used)
     corrected = replace(released, left=replace(released.left, shape_directions=mended))
-    agrees(found, arctic_joints("left", released), arctic_joints("left", corrected))
+    agrees(actual, arctic_joints("left", released), arctic_joints("left", corrected))
 
 
 def canonical_mm(angle: float, moving: tuple[int, ...] = (4, 5, 6, 7)) -> np.ndarray:
-    """The template with the moving vertices turned about (0, 0, -1): Rz(-angle)."""
+    """The template with the moving vertices rotated about (0, 0, -1): Rz(-angle)."""
     points = np.array(BOTTOM_MM + TOP_MM)
     cosine, sine = np.cos(angle), np.sin(angle)
-    turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    points[list(moving)] = points[list(moving)] @ turn.T
+    rotation = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    points[list(moving)] = points[list(moving)] @ rotation.T
     return points
 
 
@@ -122,10 +122,10 @@ def in_world_m(points_mm: np.ndarray) -> np.ndarray:
 
 
 def clip_points(clip) -> np.ndarray:
-    """World points of the object from what the clip says: part 1 turned by R(axis * angle) about the hinge origin."""
+    """World points of the object from the clip: part 1 rotated by R(axis * angle) about the hinge origin."""
     model, track, frame = clip.object.model, clip.object, at(clip)
-    turn = Rotation.from_rotvec(np.array(model.hinge.axis) * track.hinge_rad[frame])
-    moved = turn.apply(model.vertices_m - model.hinge.origin_m) + model.hinge.origin_m
+    rotation = Rotation.from_rotvec(np.array(model.hinge.axis) * track.hinge_rad[frame])
+    moved = rotation.apply(model.vertices_m - model.hinge.origin_m) + model.hinge.origin_m
     local = np.where(model.part[:, None] == 1, moved, model.vertices_m)
     return Rotation.from_rotvec(track.rotvec[frame]).apply(local) + track.translation_m[frame]
 
@@ -141,19 +141,19 @@ class TestObject:
         rest = rest_points(hands.left, SHAPE["left"])
         assert off_m(clip.hands["left"].wrist_m[at(clip)], rest[0] + np.array(TRANS["left"]) / 1000) > WRONG_M
 
-    def test_it_is_turned_as_column_vectors(self, clip):
-        found = clip_points(clip)
+    def test_it_rotates_column_vectors(self, clip):
+        actual = clip_points(clip)
         as_rows = (canonical_mm(ANGLE) @ Rotation.from_rotvec(OBJECT_ORIENT).as_matrix() + OBJECT_MM) / 1000
-        agrees(found, in_world_m(canonical_mm(ANGLE)), as_rows)
+        agrees(actual, in_world_m(canonical_mm(ANGLE)), as_rows)
 
     def test_part_0_of_the_file_is_the_top_and_moves(self, clip):
-        found = clip_points(clip)
-        agrees(found, in_world_m(canonical_mm(ANGLE)), in_world_m(canonical_mm(ANGLE, moving=(0, 1, 2, 3))))
+        actual = clip_points(clip)
+        agrees(actual, in_world_m(canonical_mm(ANGLE)), in_world_m(canonical_mm(ANGLE, moving=(0, 1, 2, 3))))
         assert clip.object.model.part.tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
 
-    def test_the_hinge_turns_about_minus_z(self, clip):
-        found = clip_points(clip)
-        agrees(found, in_world_m(canonical_mm(ANGLE)), in_world_m(canonical_mm(-ANGLE)))
+    def test_the_hinge_rotates_about_minus_z(self, clip):
+        actual = clip_points(clip)
+        agrees(actual, in_world_m(canonical_mm(ANGLE)), in_world_m(canonical_mm(-ANGLE)))
 
     def test_hinge_angles_are_not_wrapped(self, clip):
         np.testing.assert_allclose(clip.object.hinge_rad, recording.ANGLE[clip.source_frames], atol=EXACT_M)
@@ -175,11 +175,11 @@ class TestHeadCamera:
 
     def test_the_file_takes_the_world_to_the_camera_and_the_clip_the_camera_to_the_world(self, clip):
         camera = clip.camera
-        seen = HEAD_TURN.apply(self.POINT_M) + HEAD_SHIFT_M
-        turn, place = Rotation.from_rotvec(camera.rotvec[at(clip)]), camera.position_m[at(clip)]
-        the_other_way = HEAD_TURN.apply(seen) + HEAD_SHIFT_M
-        agrees(turn.apply(seen) + place, self.POINT_M, the_other_way)
-        assert off_m(place, HEAD_SHIFT_M) > WRONG_M
+        point_camera = HEAD_TURN.apply(self.POINT_M) + HEAD_SHIFT_M
+        rotation, position_m = Rotation.from_rotvec(camera.rotvec[at(clip)]), camera.position_m[at(clip)]
+        the_other_way = HEAD_TURN.apply(point_camera) + HEAD_SHIFT_M
+        agrees(rotation.apply(point_camera) + position_m, self.POINT_M, the_other_way)
+        assert off_m(position_m, HEAD_SHIFT_M) > WRONG_M
 
     def test_intrinsics_are_focal_lengths_centre_and_size_of_the_image(self, clip):
         assert clip.camera.name == "ego"
@@ -208,7 +208,7 @@ def test_things_fall_along_minus_z(clip):
 class TestSeatedPerson(SeatedPersonContract):
     @pytest.fixture
     def look(self, tmp_path, hands, load_all):
-        """Joints of both hands and three edges of the box in the world, of a person whose numbers are given."""
+        """Joints of both hands and three edges of the box in the world, of a person of known pose."""
 
         def of(person):
             root = write(tmp_path)

@@ -1,5 +1,6 @@
-"""GRAB's conventions, one test each: numbers typed here, formulas of the publication, and the same with the convention
-the other way round, which must be off by more than 5 mm (or by a frame). Neither our writer nor our engine is used."""
+"""GRAB's conventions, one test each: literal numbers, formulas of the publication, and the same with the flipped
+convention, which must be off by more than 5 mm (or by a frame). The formulas use neither a builder nor hoidata's code.
+"""
 
 from pathlib import Path
 
@@ -13,8 +14,8 @@ from tests.builders.formulas import EXACT_M, WRONG_M, agrees, chain, joints_as_s
 from tests.hoidata.datasets.contract import SeatedPersonContract
 
 N_FRAMES = 81  # 120 Hz; frames 0, 4, ..., 80 are those of 30 Hz
-FIRST_TOUCH, LAST_TOUCH = 22, 56  # no multiple of 4, and one: 24 to 56 are kept
-AT = 36  # the frame that is looked at; it is the clip's fourth
+FIRST_TOUCH, LAST_TOUCH = 22, 56  # not a multiple of 4, and a multiple: the clip has 24 to 56
+AT = 36  # the tested frame, the fourth of the clip
 MUG_M = [[0.05, 0.0, -0.02], [0.0, 0.07, 0.0], [-0.05, 0.0, 0.03], [0.0, -0.04, 0.06], [0.02, 0.03, 0.09]]
 MUG_FACES = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4], [0, 3, 2], [0, 2, 1]]
 TABLE_M = [[0.6, 0.4, 0.0], [-0.6, 0.4, 0.0], [-0.6, -0.4, 0.0], [0.6, -0.4, 0.0], [0.0, 0.0, -0.05]]
@@ -40,7 +41,7 @@ def every_frame(row) -> np.ndarray:
 
 
 def personal_mesh(hands, side: str) -> np.ndarray:
-    """Hands 12 % longer than the model's and filed 4 cm from its origin, the left another way than the right."""
+    """Hands 12 % longer than the model's and 4 cm from its origin, in different directions for left and right."""
     shift = {"left": (0.04, -0.01, 0.0), "right": (0.0, 0.03, -0.02)}[side]
     return np.float32(hands[side].template_m * 1.12 + shift).astype(np.float64)
 
@@ -51,8 +52,8 @@ def hand_block(side: str) -> dict:
     return {"params": params, "vtemp": f"tools/subject_meshes/female/s8_{side[0]}hand.ply"}
 
 
-def thing_block(name: str, orient, place) -> dict:
-    return {"global_orient": every_frame(orient), "transl": every_frame(place)}
+def thing_block(name: str, orient, position_m) -> dict:
+    return {"global_orient": every_frame(orient), "transl": every_frame(position_m)}
 
 
 def recording() -> dict:
@@ -114,44 +115,44 @@ def placed(track, frame: int) -> np.ndarray:
 
 
 def hand_joints(clip, side: str, hands) -> np.ndarray:
-    """(16, 3) joints of the frame looked at, from what the clip says."""
+    """(16, 3) joints of the tested frame, from the clip."""
     return joints_as_stored(clip.hands[side], hands[side], at(clip))
 
 
 def grab_joints(side: str, hands, bends=None, mesh=None, orient=None) -> np.ndarray:
-    """(16, 3) joints as GRAB means its numbers: the subject's own mesh, absolute bends, turned about J0, then moved."""
+    """(16, 3) joints by GRAB's convention: the subject's mesh, absolute angles, rotated about J0, then translated."""
     rest = rest_points(hands[side], template_m=personal_mesh(hands, side) if mesh is None else mesh)
     return chain(rest, ORIENT[side], fingers() if bends is None else bends, TRANSL[side])
 
 
-def row_vectors(points, orient, place) -> np.ndarray:
-    return np.array(points) @ Rotation.from_rotvec(orient).as_matrix() + place
+def row_vectors(points, orient, position_m) -> np.ndarray:
+    return np.array(points) @ Rotation.from_rotvec(orient).as_matrix() + position_m
 
 
-def test_objects_are_turned_as_row_vectors(load):
-    found = placed(load().object, 3)
+def test_objects_rotate_as_row_vectors(load):
+    actual = placed(load().object, 3)
     as_columns = Rotation.from_rotvec(MUG_ORIENT).apply(MUG_M) + MUG_PLACE
-    agrees(found, row_vectors(MUG_M, MUG_ORIENT, MUG_PLACE), as_columns)
+    agrees(actual, row_vectors(MUG_M, MUG_ORIENT, MUG_PLACE), as_columns)
 
 
-def test_objects_turn_about_the_origin_of_their_mesh_not_its_middle(load):
-    found, middle = placed(load().object, 3), np.mean(MUG_M, axis=0)
+def test_objects_rotate_about_the_origin_of_their_mesh_not_its_centre(load):
+    actual, middle = placed(load().object, 3), np.mean(MUG_M, axis=0)
     about_middle = row_vectors(np.array(MUG_M) - middle, MUG_ORIENT, MUG_PLACE) + middle
-    agrees(found, row_vectors(MUG_M, MUG_ORIENT, MUG_PLACE), about_middle)
+    agrees(actual, row_vectors(MUG_M, MUG_ORIENT, MUG_PLACE), about_middle)
 
 
-def test_an_object_turned_beyond_pi_is_stored_as_the_same_rotation_of_at_most_pi(load):
+def test_an_object_rotation_beyond_pi_is_stored_as_the_same_rotation_of_at_most_pi(load):
     """Row vectors: the stored rotation is the transpose of 5 rad about z, -(5 - 2 pi)."""
     clip = load(lambda data: data["object"]["params"].update(global_orient=np.tile((0.0, 0.0, 5.0), (N_FRAMES, 1))))
     np.testing.assert_allclose(clip.object.rotvec, [(0, 0, 2 * np.pi - 5.0)] * clip.n_frames, atol=EXACT_M)
 
 
-def test_the_table_is_turned_as_row_vectors(load):
+def test_the_table_rotates_as_row_vectors(load):
     (table,) = load().other_objects
     assert table.model.name == "table"
-    found = placed(table, 3)
+    actual = placed(table, 3)
     as_columns = Rotation.from_rotvec(TABLE_ORIENT).apply(TABLE_M) + TABLE_PLACE
-    agrees(found, row_vectors(TABLE_M, TABLE_ORIENT, TABLE_PLACE), as_columns)
+    agrees(actual, row_vectors(TABLE_M, TABLE_ORIENT, TABLE_PLACE), as_columns)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -159,9 +160,9 @@ class TestHands:
     def test_fingers_are_absolute(self, load, hands, side):
         clip = load()
         np.testing.assert_allclose(clip.hands[side].hand_pose[at(clip)], fingers(), atol=EXACT_M)
-        found = hand_joints(clip, side, hands)
+        actual = hand_joints(clip, side, hands)
         with_mean = grab_joints(side, hands, bends=fingers() + hands[side].mean_pose)
-        agrees(found, grab_joints(side, hands), with_mean)
+        agrees(actual, grab_joints(side, hands), with_mean)
 
     @pytest.mark.parametrize("count", [1, 6, 24, 45])
     def test_components_are_weights_of_the_models_first_rows_without_the_mean(self, load, hands, side, count):
@@ -172,15 +173,15 @@ class TestHands:
             del params["fullpose"]
             params["hand_pose"] = np.tile(weights, (N_FRAMES, 1))
 
-        found = hand_joints(load(only_components), side, hands)
+        actual = hand_joints(load(only_components), side, hands)
         bends = sum(weight * row for weight, row in zip(weights, hands[side].components, strict=False))
         agrees(
-            found, grab_joints(side, hands, bends=bends), grab_joints(side, hands, bends=bends + hands[side].mean_pose)
+            actual, grab_joints(side, hands, bends=bends), grab_joints(side, hands, bends=bends + hands[side].mean_pose)
         )
         columns = hands[side].components[:, :count] @ weights
-        assert off_m(found, grab_joints(side, hands, bends=columns)) > WRONG_M
+        assert off_m(actual, grab_joints(side, hands, bends=columns)) > WRONG_M
         as_angles = np.concatenate((weights, np.zeros(45 - count)))
-        assert off_m(found, grab_joints(side, hands, bends=as_angles)) > WRONG_M
+        assert off_m(actual, grab_joints(side, hands, bends=as_angles)) > WRONG_M
 
     def test_fullpose_wins_over_components(self, load, side):
         def both(data):
@@ -189,28 +190,28 @@ class TestHands:
         clip = load(both)
         np.testing.assert_allclose(clip.hands[side].hand_pose[at(clip)], fingers(), atol=EXACT_M)
 
-    def test_the_rest_mesh_is_the_subjects_own_and_there_are_no_betas(self, load, hands, side):
+    def test_the_rest_mesh_is_that_of_the_subject_without_betas(self, load, hands, side):
         clip = load()
         np.testing.assert_allclose(clip.hands[side].template_m, personal_mesh(hands, side), atol=EXACT_M)
         assert clip.hands[side].betas.tolist() == [[0.0] * 10]
-        found = hand_joints(clip, side, hands)
-        agrees(found, grab_joints(side, hands), grab_joints(side, hands, mesh=hands[side].template_m))
+        actual = hand_joints(clip, side, hands)
+        agrees(actual, grab_joints(side, hands), grab_joints(side, hands, mesh=hands[side].template_m))
 
-    def test_the_hand_turns_about_its_rest_wrist_and_is_moved_by_transl(self, load, hands, side):
+    def test_the_hand_rotates_about_its_rest_wrist_and_is_moved_by_transl(self, load, hands, side):
         clip = load()
         rest = rest_points(hands[side], template_m=personal_mesh(hands, side))[:16]
-        found = hand_joints(clip, side, hands)
+        actual = hand_joints(clip, side, hands)
         assert off_m(clip.hands[side].wrist_m[at(clip)], rest[0] + TRANSL[side]) < EXACT_M
         wrist_at_transl = grab_joints(side, hands) - rest[0]
-        assert off_m(found, wrist_at_transl) > WRONG_M
+        assert off_m(actual, wrist_at_transl) > WRONG_M
         about_origin = Rotation.from_rotvec(ORIENT[side]).apply(rest[0]) + TRANSL[side]
         assert off_m(clip.hands[side].wrist_m[at(clip)], about_origin) > WRONG_M
 
-    def test_hands_turn_as_column_vectors_unlike_objects(self, load, hands, side):
-        found = hand_joints(load(), side, hands)
+    def test_hands_rotate_as_column_vectors_unlike_objects(self, load, hands, side):
+        actual = hand_joints(load(), side, hands)
         rest = rest_points(hands[side], template_m=personal_mesh(hands, side))
         turned_back = chain(rest, -np.array(ORIENT[side]), fingers(), TRANSL[side])
-        agrees(found, grab_joints(side, hands), turned_back)
+        agrees(actual, grab_joints(side, hands), turned_back)
 
 
 def test_meshes_and_places_are_metres(load):
@@ -230,7 +231,7 @@ def test_every_fourth_frame_counts_from_the_first_of_the_file_and_both_ends_of_t
 
 
 @pytest.mark.parametrize(("fps", "step"), [(30.0, 1), (60, 2), (120.0, 4), (240, 8)])
-def test_the_files_own_frame_rate_says_how_many_frames_are_skipped(load, fps, step):
+def test_the_frame_rate_of_the_file_determines_how_many_frames_are_skipped(load, fps, step):
     clip = load(lambda data: data.update(framerate=fps))
     first = -(-FIRST_TOUCH // step) * step
     assert clip.source_frames.tolist() == list(range(first, LAST_TOUCH + 1, step))
@@ -239,8 +240,8 @@ def test_the_files_own_frame_rate_says_how_many_frames_are_skipped(load, fps, st
 
 def test_contact_labels_keep_frame_vertex_and_toucher(load):
     contact = load().source_contact
-    found = list(zip(contact.frame.tolist(), contact.vertex.tolist(), contact.label.tolist(), strict=True))
-    assert found == sorted([*((frame, 2, 41) for frame in range(9)), (3, 4, 22)])
+    actual = list(zip(contact.frame.tolist(), contact.vertex.tolist(), contact.label.tolist(), strict=True))
+    assert actual == sorted([*((frame, 2, 41) for frame in range(9)), (3, 4, 22)])
     assert (contact.frame.dtype, contact.vertex.dtype, contact.label.dtype) == (np.int32, np.int32, np.uint8)
 
 
@@ -255,7 +256,7 @@ MUG_EDGES = [[-0.1, 0.0, 0.0], [0.0, 0.08, 0.0], [0.0, 0.0, 0.05]]
 class TestSeatedPerson(SeatedPersonContract):
     @pytest.fixture
     def look(self, root, hands, load_all):
-        """Joints of both hands and the mug's three edges in the world, of a person whose numbers are given."""
+        """Joints of both hands and the mug's three edges in the world, of a person of known pose."""
 
         def of(person):
             data = recording()

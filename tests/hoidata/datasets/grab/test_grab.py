@@ -1,4 +1,4 @@
-"""GRAB: one NPZ and its meshes written by hand, what their numbers must mean, and table, body and contact labels."""
+"""GRAB's adapter on one handwritten NPZ and its meshes: motion, table, body and contact labels."""
 
 from pathlib import Path
 
@@ -131,7 +131,7 @@ def test_without_a_table_or_its_mesh_there_is_none_and_nothing_is_wrong(root, lo
     assert clip.other_objects == ()
 
 
-def test_the_body_is_left_out_until_it_is_asked_for(root, load_all):
+def test_the_body_is_included_on_request_only(root, load_all):
     recording.write_sequence(root, recording.with_body())
     assert load_all(GrabAdapter(), root)[0].body is None
     (clip,) = load_all(GrabAdapter(body=True), root)
@@ -166,7 +166,8 @@ def labelled(dtype=np.int8, order: str = "C") -> dict:
     return data
 
 
-# Frames 12 to 44 hold label 22 on vertex 3; frame 30 is no strided one, 32 is the clip's fifth and holds three.
+# Frames 12 to 44 hold label 22 on vertex 3; frame 30 is skipped by the stride, 32 is the clip's fifth and has three
+# labels.
 ENTRIES = sorted([*((frame, 3, 22) for frame in range(9)), (5, 7, 21), (5, 1, 40)])
 
 
@@ -191,7 +192,7 @@ def test_contact_labels_count_frames_of_the_clip_with_its_margin(root, load_all)
     assert entries(clip.source_contact)[0] == (3, 3, 22)
 
 
-def test_contact_labels_can_be_left_out(root, load_all):
+def test_contact_labels_can_be_excluded(root, load_all):
     (clip,) = load_all(GrabAdapter(contact=False), root)
     assert clip.source_contact is None
     assert clip.source_frames[[0, -1]].tolist() == [12, 44]

@@ -1,15 +1,15 @@
-"""H2O keeps the contract of all adapters; what can be wrong with its files."""
+"""H2O passes the tests of all adapters; also the problems its files can have."""
 
 from collections.abc import Iterable
 
 import numpy as np
 
 from tests.builders import h2o
-from tests.builders.spoilt import (
+from tests.builders.corruption import (
     FAR_CORNER_OBJ,
     FLAT_OBJ,
     NO_FACE_OBJ,
-    Spoil,
+    Corrupt,
     at,
     cut_in_half,
     emptied,
@@ -21,7 +21,7 @@ from tests.builders.spoilt import (
     replaced,
     without_folder,
 )
-from tests.hoidata.datasets.contract import AdapterContract, Row
+from tests.hoidata.datasets.contract import AdapterContract, FileProblem
 
 FOLDER = "subject2/k1/3/cam4"
 CAMERA, HAND, POSE, LABEL = (
@@ -30,13 +30,13 @@ CAMERA, HAND, POSE, LABEL = (
 MESH = "object/chips/chips.obj"
 
 
-def numbers(path: str, values: object) -> Spoil:
+def numbers(path: str, values: object) -> Corrupt:
     return holding(path, " ".join(repr(float(value)) for value in np.ravel(values)))
 
 
 class TestH2O(AdapterContract):
     name = "h2o"
-    spoilt = "h2o/subject2/k1/3"
+    corrupted_sequence = "h2o/subject2/k1/3"
     write = staticmethod(h2o.write_two)
     bad_settings = {  # noqa: RUF012
         "margin_frames": (-5, "0 or more"),
@@ -59,31 +59,31 @@ class TestH2O(AdapterContract):
         "frames": "test_the_last_labelled_frame_belongs_to_the_clip",
         "validity": "test_a_hand_without_its_flag_is_not_valid_although_numbers_stand_there",
         "labels": "test_label_seven_is_grab_chips_and_class_seven_is_chips",
-        "gravity": "test_gravity.py::test_gravity_is_where_the_objects_stand",
+        "gravity": "test_gravity.py::test_gravity_points_to_the_side_on_which_objects_stand",
     }
 
     @staticmethod
-    def rows() -> Iterable[Row]:
+    def file_problems() -> Iterable[FileProblem]:
         last = f"{FOLDER}/hand_pose_mano/000026.txt"
-        yield Row("truncated file", HAND, at(HAND, cut_in_half), "124 numbers")
-        yield Row("empty file", CAMERA, at(CAMERA, emptied), "16 numbers")
-        yield Row("malicious pickle", HAND, at(HAND, malicious), "124 numbers")
-        yield Row("NaN", POSE, at(POSE, replaced(b"0.45", b"nan")), "finite")
-        yield Row("infinity", HAND, at(HAND, replaced(b"1.1", b"inf")), "finite")
-        yield Row("wrong columns", HAND, at(HAND, lambda data: data + b" 5"), "got 125")
-        yield Row("wrong dtype (words)", POSE, at(POSE, replaced(b"0.45", b"near")), "17 numbers")
-        yield Row("missing camera file", CAMERA, removed(CAMERA), "nothing there")
-        yield Row("missing object file", MESH, removed(MESH), "object's mesh")
-        yield Row("frame-count mismatch", last, removed(last), "one file for each of 27 frames")
-        yield Row("non-UTF-8 text", LABEL, holding(LABEL, b"\xff\xfe2\x006\x00"), "1 numbers")
-        yield Row("symlink out of the root", CAMERA, linked_outside(CAMERA), "link that leaves")
-        yield Row("zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces")
-        yield Row("mesh without area", MESH, holding(MESH, FLAT_OBJ), "faces with area")
-        yield Row("absurd size (frame file)", HAND, at(HAND, lambda data: data + b" 0" * (1 << 20)), "at most")
-        yield Row("absurd size (corner 10^9)", MESH, holding(MESH, FAR_CORNER_OBJ), "face corners")
+        yield FileProblem("truncated file", HAND, at(HAND, cut_in_half), "124 numbers")
+        yield FileProblem("empty file", CAMERA, at(CAMERA, emptied), "16 numbers")
+        yield FileProblem("malicious pickle", HAND, at(HAND, malicious), "124 numbers")
+        yield FileProblem("NaN", POSE, at(POSE, replaced(b"0.45", b"nan")), "finite")
+        yield FileProblem("infinity", HAND, at(HAND, replaced(b"1.1", b"inf")), "finite")
+        yield FileProblem("wrong columns", HAND, at(HAND, lambda data: data + b" 5"), "got 125")
+        yield FileProblem("wrong dtype (words)", POSE, at(POSE, replaced(b"0.45", b"near")), "17 numbers")
+        yield FileProblem("missing camera file", CAMERA, removed(CAMERA), "nothing there")
+        yield FileProblem("missing object file", MESH, removed(MESH), "object's mesh")
+        yield FileProblem("frame-count mismatch", last, removed(last), "one file for each of 27 frames")
+        yield FileProblem("non-UTF-8 text", LABEL, holding(LABEL, b"\xff\xfe2\x006\x00"), "1 numbers")
+        yield FileProblem("symlink out of the root", CAMERA, linked_outside(CAMERA), "link that leaves")
+        yield FileProblem("zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces")
+        yield FileProblem("mesh without area", MESH, holding(MESH, FLAT_OBJ), "faces with area")
+        yield FileProblem("absurd size (frame file)", HAND, at(HAND, lambda data: data + b" 0" * (1 << 20)), "at most")
+        yield FileProblem("absurd size (corner 10^9)", MESH, holding(MESH, FAR_CORNER_OBJ), "face corners")
 
     @staticmethod
-    def further_rows() -> Iterable[Row]:
+    def format_problems() -> Iterable[FileProblem]:
         intrinsics, beyond = f"{FOLDER}/cam_intrinsics.txt", f"{FOLDER}/cam_pose/000027.txt"
         mirror = [7, *(h2o.object_in_camera(10) @ np.diag([1, 1, -1, 1])).ravel()]
         first_two = [numbers(f"{FOLDER}/obj_pose_rt/00000{frame}.txt", np.zeros(17)) for frame in (0, 1)]
@@ -91,22 +91,24 @@ class TestH2O(AdapterContract):
         kinds = ("cam_pose", "hand_pose_mano", "obj_pose_rt", "action_label")
         gap = one_after_the_other(*(removed(f"{FOLDER}/{kind}/000010.txt") for kind in kinds))
         far = b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
-        yield Row("a frame that no folder has", CAMERA, gap, "each of 27 frames")
-        yield Row("a frame too many", "000027", numbers(beyond, h2o.camera(27)), "each of 28 frames")
-        yield Row("too many columns", POSE, at(POSE, lambda data: data + b" 1.0"), "17")
-        yield Row("infinity in a pose", POSE, numbers(POSE, [1e308] * 16 + [np.inf]), "finite")
-        yield Row("an empty first line", CAMERA, at(CAMERA, lambda data: b"\n" + data), "16 numbers, got 0")
-        yield Row("a binary file", HAND, holding(HAND, bytes(range(256))), "124 numbers")
-        yield Row("JSON", LABEL, holding(LABEL, "[26]"), "1 numbers")
-        yield Row("a label that is no whole number", LABEL, holding(LABEL, "26.5"), "0 to 36")
-        yield Row("an unknown label", LABEL, holding(LABEL, "37"), "0 to 36")
-        yield Row("an unknown object", POSE, numbers(POSE, [9, *np.eye(4).ravel()]), "0 to 8")
-        yield Row("broken intrinsics", intrinsics, holding(intrinsics, "636.6 636.3"), "6 numbers, got 2")
-        yield Row("a matrix that is no rotation", CAMERA, numbers(CAMERA, [0.5] * 16), "rotation")
-        yield Row("a matrix by columns", CAMERA, numbers(CAMERA, h2o.camera(10).T), "row 0 0 0 1")
-        yield Row("a mirror", POSE, numbers(POSE, mirror), "a mirror")
-        yield Row("a bad pose behind frames without object", POSE, behind, "rotation")
+        yield FileProblem("a frame that no folder has", CAMERA, gap, "each of 27 frames")
+        yield FileProblem("a frame too many", "000027", numbers(beyond, h2o.camera(27)), "each of 28 frames")
+        yield FileProblem("too many columns", POSE, at(POSE, lambda data: data + b" 1.0"), "17")
+        yield FileProblem("infinity in a pose", POSE, numbers(POSE, [1e308] * 16 + [np.inf]), "finite")
+        yield FileProblem("an empty first line", CAMERA, at(CAMERA, lambda data: b"\n" + data), "16 numbers, got 0")
+        yield FileProblem("a binary file", HAND, holding(HAND, bytes(range(256))), "124 numbers")
+        yield FileProblem("JSON", LABEL, holding(LABEL, "[26]"), "1 numbers")
+        yield FileProblem("a label that is no whole number", LABEL, holding(LABEL, "26.5"), "0 to 36")
+        yield FileProblem("an unknown label", LABEL, holding(LABEL, "37"), "0 to 36")
+        yield FileProblem("an unknown object", POSE, numbers(POSE, [9, *np.eye(4).ravel()]), "0 to 8")
+        yield FileProblem("broken intrinsics", intrinsics, holding(intrinsics, "636.6 636.3"), "6 numbers, got 2")
+        yield FileProblem("a matrix that is no rotation", CAMERA, numbers(CAMERA, [0.5] * 16), "rotation")
+        yield FileProblem("a matrix by columns", CAMERA, numbers(CAMERA, h2o.camera(10).T), "row 0 0 0 1")
+        yield FileProblem("a mirror", POSE, numbers(POSE, mirror), "a mirror")
+        yield FileProblem("a bad pose behind frames without object", POSE, behind, "rotation")
         for kind in kinds[:3]:
-            yield Row(f"no {kind}", f"cam4/{kind}", without_folder(f"{FOLDER}/{kind}"), "a folder of NNNNNN.txt files")
-        yield Row("an empty mesh", MESH, at(MESH, emptied), "vertices")
-        yield Row("a mesh with NaN", MESH, holding(MESH, far), "finite")
+            yield FileProblem(
+                f"no {kind}", f"cam4/{kind}", without_folder(f"{FOLDER}/{kind}"), "a folder of NNNNNN.txt files"
+            )
+        yield FileProblem("an empty mesh", MESH, at(MESH, emptied), "vertices")
+        yield FileProblem("a mesh with NaN", MESH, holding(MESH, far), "finite")

@@ -1,5 +1,5 @@
-"""H2O's conventions, one test each: the clip equals an independent formula, and the formula with that convention turned
-round is far from it (5 mm, or another discrete fact). Formulas: NumPy and SciPy on the numbers typed here.
+"""H2O's conventions, one test each: the clip equals an independent formula, and the formula with the flipped convention
+differs by 5 mm or by a discrete value. Formulas: NumPy and SciPy on the numbers typed here.
 
 Sources: README of the dataset and the author's viewer (taeinkwon/h2odataset, taeinkwon/h2oplayer).
 """
@@ -43,7 +43,7 @@ def hand_row(frame: int, left_flag: float = 1.0) -> list[float]:
 
 
 def joints_row(left_flag: float = 1.0) -> list[float]:
-    """hand_pose of a hand that lies flat before the camera: chain of each finger typed in OpenPose's order."""
+    """hand_pose of a flat hand in front of the camera, with the chain of each finger in OpenPose's order."""
     x = {"thumb": 0.045, "index": 0.025, "middle": 0.0, "ring": -0.02, "pinky": -0.04}
     start = {"thumb": 0.03, "index": 0.09, "middle": 0.092, "ring": 0.085, "pinky": 0.075}
     step = {"thumb": 0.03, "index": 0.028, "middle": 0.03, "ring": 0.027, "pinky": 0.021}
@@ -110,7 +110,7 @@ FRAMES = (4, 11, 26)
 
 
 def seen_right(frame: int, **change) -> np.ndarray:
-    """(16, 3) joints of the right hand in the camera's frame; ``change`` turns one convention round."""
+    """(16, 3) joints of the right hand in the camera's frame; ``change`` flips one convention."""
     shape = change.get("betas", betas(RIGHT_BETAS, frame))
     rest = rest_points(MODELS.right, shape)
     fingers = np.zeros(45)
@@ -136,7 +136,7 @@ def test_camera_files_are_written_by_rows(joints):
     check(joints, lambda frame: seen_right(frame) @ camera(frame)[:3, :3] + camera(frame)[:3, 3])
 
 
-def test_each_frame_has_the_camera_of_its_own_number(joints):
+def test_each_frame_has_the_camera_of_its_number(joints):
     check(joints, lambda frame: to_world(seen_right(frame), frame - 1))
 
 
@@ -148,12 +148,12 @@ def test_the_translation_is_added_to_the_rest_wrist(joints):
     check(joints, as_wrist)
 
 
-def test_a_change_of_frame_turns_the_wrist_and_not_the_translation_alone(joints):
+def test_a_change_of_frame_rotates_the_wrist_and_not_the_translation_alone(joints):
     def naive(frame: int) -> np.ndarray:
-        """Turned hand at ``A t + b``, as if the model turned about its origin."""
+        """The rotated hand at ``A t + b``, as if the model rotated about its origin."""
         rest = rest_points(MODELS.right, betas(RIGHT_BETAS, frame))
-        turned = (seen_right(frame) - RIGHT_T - rest[0]) @ camera(frame)[:3, :3].T
-        return turned + rest[0] + camera(frame)[:3, :3] @ RIGHT_T + camera(frame)[:3, 3]
+        rotated = (seen_right(frame) - RIGHT_T - rest[0]) @ camera(frame)[:3, :3].T
+        return rotated + rest[0] + camera(frame)[:3, :3] @ RIGHT_T + camera(frame)[:3, 3]
 
     check(joints, naive)
 
@@ -174,7 +174,7 @@ def test_betas_are_read_in_every_frame(clip, joints):
 
 
 def left_vertices(model, frame: int) -> np.ndarray:
-    """(778, 3) shaped but unposed left hand about its wrist: enough to see what its shape directions are."""
+    """(778, 3) shaped but unposed left hand relative to its wrist, which shows the shape directions."""
     shaped = model.template_m + model.shape_directions @ betas(LEFT_BETAS, frame)
     return shaped - model.joint_regressor[0] @ shaped
 
@@ -212,7 +212,7 @@ def test_a_block_has_62_numbers_and_not_the_59_of_the_readme(clip):
 
 
 def test_everything_is_in_metres(clip, joints):
-    """A hand at arm's length before the camera, an object 23 cm high; millimetres would be a thousand times off."""
+    """A hand at arm's length from the camera, an object 23 cm high; millimetres would be 1000 times off."""
     distance = np.linalg.norm(joints["right"][11][0] - camera(11)[:3, 3])
     assert 0.2 < distance < 0.8
     bones = np.linalg.norm(np.diff(joints["right"][11][4:7], axis=0), axis=1)
@@ -225,8 +225,8 @@ def test_everything_is_in_metres(clip, joints):
 def test_the_object_goes_from_its_frame_through_the_camera_to_the_world(clip):
     vertices = clip.object.model.vertices_m
     for frame in FRAMES:
-        turn = Rotation.from_rotvec(clip.object.rotvec[frame - FIRST]).as_matrix()
-        placed = vertices @ turn.T + clip.object.translation_m[frame - FIRST]
+        rotation = Rotation.from_rotvec(clip.object.rotvec[frame - FIRST]).as_matrix()
+        placed = vertices @ rotation.T + clip.object.translation_m[frame - FIRST]
 
         def through(matrix: np.ndarray, frame: int = frame) -> np.ndarray:
             return to_world(vertices @ matrix[:3, :3].T + matrix[:3, 3], frame)
@@ -264,7 +264,7 @@ def test_label_seven_is_grab_chips_and_class_seven_is_chips(clip):
     assert (clip.verb, clip.object_words, clip.object.model.name) == ("grab", "chips", "chips")
 
 
-# Ours: wrist, index, middle, pinky, ring, thumb (three joints each), then the five tips. OpenPose's, by name.
+# hoidata's order: wrist, index, middle, pinky, ring, thumb (three joints each), then five tips; OpenPose's names.
 OURS = ["wrist", *(f"{f}{j}" for f in ("index", "middle", "pinky", "ring", "thumb") for j in (0, 1, 2))]
 OURS += [f"{f}3" for f in ("index", "middle", "pinky", "ring", "thumb")]
 OPENPOSE = ["wrist", *(f"{f}{j}" for f in ("thumb", "index", "middle", "ring", "pinky") for j in (0, 1, 2, 3))]
@@ -274,14 +274,14 @@ TIPS = slice(16, 21)
 
 @pytest.fixture(scope="module")
 def fitted(root, tmp_path_factory) -> Clip:
-    """The clip from joints alone: no file of MANO parameters is there."""
+    """The clip from joints alone, without MANO parameters."""
     bare = tmp_path_factory.mktemp("bare") / "h2o"
     shutil.copytree(root, bare, ignore=shutil.ignore_patterns("hand_pose_mano"))
     return load(bare, hands="keypoints")
 
 
 def in_our_order(names: list[str], side: str) -> np.ndarray:
-    """The joints of frame 11 in the world, if the file lists them as ``names`` say."""
+    """The joints of frame 11 in the world, for a file with the joint order ``names``."""
     points = np.array(joints_row()).reshape(2, 64)[0 if side == "left" else 1, 1:].reshape(21, 3)
     named = dict(zip(names, to_world(points, 11), strict=True))
     return np.array([named[name] for name in OURS])
@@ -298,9 +298,9 @@ def test_joint_files_list_the_thumb_first_and_ring_before_pinky(fitted, side):
 
 def test_joint_files_are_in_the_frame_of_the_camera(fitted):
     joints = track_joints(fitted.hands["right"], MODELS.right)[11 - FIRST]
-    seen = (in_our_order(OPENPOSE, "right") - camera(11)[:3, 3]) @ camera(11)[:3, :3]
-    inverse = (seen - camera(11)[:3, 3]) @ camera(11)[:3, :3]
-    for wrong in (seen, inverse):
+    joints_camera = (in_our_order(OPENPOSE, "right") - camera(11)[:3, 3]) @ camera(11)[:3, :3]
+    inverse = (joints_camera - camera(11)[:3, 3]) @ camera(11)[:3, :3]
+    for wrong in (joints_camera, inverse):
         assert np.linalg.norm(joints - wrong, axis=1).min() > 20 * FAR_M
 
 

@@ -1,4 +1,4 @@
-"""H2O on the embedded corpus: gravity and hands from joints alone beside the truth."""
+"""H2O on the embedded corpus: gravity and hands from joints compared with the ground truth."""
 
 import numpy as np
 import pytest
@@ -9,11 +9,11 @@ from hoidata.hands import track_joints
 pytestmark = pytest.mark.slow
 
 
-def test_gravity_is_straight_down_where_it_is_known_and_says_how_it_was_found(small_corpus, load_all):
+def test_gravity_is_straight_down_if_it_is_known_and_has_a_note_on_the_evidence(small_corpus, load_all):
     clips = load_all(H2OAdapter(), small_corpus("h2o").raw)
-    known = [clip for clip in clips if clip.gravity is not None]
-    assert len(known) >= 0.7 * len(clips)
-    for clip in known:
+    with_gravity = [clip for clip in clips if clip.gravity is not None]
+    assert len(with_gravity) >= 0.7 * len(clips)
+    for clip in with_gravity:
         np.testing.assert_allclose(clip.gravity, (0, 0, -1), atol=1e-3)
         assert clip.gravity_note.startswith("estimated from")
     for clip in clips:
@@ -21,12 +21,12 @@ def test_gravity_is_straight_down_where_it_is_known_and_says_how_it_was_found(sm
 
 
 def test_hands_fitted_to_the_joints_are_those_of_the_parameters(small_corpus, load_all, hands):
-    fitted, given = (
+    fitted, from_parameters = (
         load_all(H2OAdapter(hands="keypoints"), small_corpus("h2o").raw),
         load_all(H2OAdapter(), small_corpus("h2o").raw),
     )
-    assert [clip.clip_id for clip in fitted] == [clip.clip_id for clip in given]
-    for ours, theirs in zip(fitted, given, strict=True):
+    assert [clip.clip_id for clip in fitted] == [clip.clip_id for clip in from_parameters]
+    for ours, theirs in zip(fitted, from_parameters, strict=True):
         np.testing.assert_array_equal(ours.source_frames, theirs.source_frames)
         assert ours.fit_error_m < 5e-4
         for side, track in ours.hands.items():

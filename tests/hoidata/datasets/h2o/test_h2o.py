@@ -1,6 +1,6 @@
-"""H2O: a tree of text files written by hand, what becomes of it, and its text read bit for bit.
+"""H2O's adapter on handwritten text files, and the bitwise exact parser.
 
-Also subject 4: its action labels are withheld, its segments are not.
+Also subject 4, whose action labels are withheld and whose segments are published.
 """
 
 import shutil
@@ -76,7 +76,7 @@ def test_a_margin_widens_the_clip_within_the_recording(root, load_all):
     assert clip.source_frames.tolist() == list(range(27))
 
 
-def test_another_object_class_than_the_label_names_is_left_out_with_its_reason(root, load_all):
+def test_another_object_class_than_that_of_the_label_is_rejected_with_its_reason(root, load_all):
     write_text(root / "subject2/k1/3/cam4/obj_pose_rt/000010.txt", [5, *object_in_camera(10).ravel()])
     (item,) = load_all(H2OAdapter(), root)
     assert isinstance(item, Quarantined)
@@ -95,21 +95,21 @@ def test_three_frames_without_the_object_are_bridged_and_marked_and_four_are_nam
     for frame in (8, 9, 10, 15):
         write_text(root / f"subject2/k1/3/cam4/obj_pose_rt/{frame:06d}.txt", [0, *np.zeros(16)])
     (clip,) = load_all(H2OAdapter(), root)
-    made = [8, 9, 10, 15]
+    interpolated = [8, 9, 10, 15]
     assert clip.camera.images.tolist() == list(range(3, 25))
-    assert (np.flatnonzero(~clip.recorded) + 3).tolist() == made
+    assert (np.flatnonzero(~clip.recorded) + 3).tolist() == interpolated
     assert clip.source_frames.tolist() == [7 if at in (8, 9, 10) else 14 if at == 15 else at for at in range(3, 25)]
-    for frame in made:
+    for frame in interpolated:
         truth = camera(frame) @ object_in_camera(frame)
         assert np.abs(clip.object.translation_m[frame - 3] - truth[:3, 3]).max() < 1e-3
-        turn = Rotation.from_rotvec(clip.object.rotvec[frame - 3]) * Rotation.from_matrix(truth[:3, :3]).inv()
-        assert np.rad2deg(turn.magnitude()) < 0.2
+        rotation = Rotation.from_rotvec(clip.object.rotvec[frame - 3]) * Rotation.from_matrix(truth[:3, :3]).inv()
+        assert np.rad2deg(rotation.magnitude()) < 0.2
     write_text(root / "subject2/k1/3/cam4/obj_pose_rt/000011.txt", [0, *np.zeros(16)])
-    found = load_all(H2OAdapter(shortest_frames=4), root)
-    assert [clip.source_frames[[0, -1]].tolist() for clip in found[:2]] == [[3, 7], [12, 24]]
-    assert isinstance(found[2], Quarantined)
-    assert "poses of chips without a gap of more than 3 frames" in found[2].expected
-    assert found[2].got == "none in source frames 8 to 11"
+    result = load_all(H2OAdapter(shortest_frames=4), root)
+    assert [clip.source_frames[[0, -1]].tolist() for clip in result[:2]] == [[3, 7], [12, 24]]
+    assert isinstance(result[2], Quarantined)
+    assert "poses of chips without a gap of more than 3 frames" in result[2].expected
+    assert result[2].got == "none in source frames 8 to 11"
 
 
 def test_the_old_name_of_an_object_folder_is_known(root, load_all):
@@ -138,7 +138,7 @@ def test_intrinsics_are_read_where_they_are(root, load_all):
 
 
 NAMES = [f"{number:06d}.txt" for number in range(20)]
-# What a writer may leave that JSON does not know: a sign, no digit beside the point, zeros in front.
+# Number formats that are not JSON: a plus sign, no digit next to the point, leading zeros.
 WRITTEN = (repr, "{:.25e}".format, "{:+.18f}".format, "{:.3f}".format, "{:G}".format, lambda value: f"{value:.0f}.")
 
 
@@ -165,12 +165,12 @@ def result_or_error(function, *arguments):
     end=st.sampled_from(["", "\n", "\r\n", " \n"]),
 )
 def test_numbers_are_those_of_numpy_to_the_last_bit(rows, write, space, end):
-    contents = [(space.join(map(write, row)) + end).encode() for row in rows]
+    contents = [(space.join(map(write, parsed)) + end).encode() for parsed in rows]
     values = parse_rows(contents, 4, "cam_pose", NAMES[: len(rows)])
     assert values.shape == (len(rows), 4)
     assert values.dtype == np.float64
-    for row, data in zip(values, contents, strict=True):
-        assert bits(row) == bits(loadtxt(data))
+    for parsed, data in zip(values, contents, strict=True):
+        assert bits(parsed) == bits(loadtxt(data))
 
 
 @pytest.mark.parametrize(
@@ -219,13 +219,27 @@ TRAIN = b"""id path action_label start_act end_act start_frame end_frame
 TEST = b"id path start_act end_act start_frame end_frame\r\n1 subject4/o1/0 30 75 0 599\r\n"
 
 
+def segment(sequence: str, label: int | None, action: tuple[int, int], frames: tuple[int, int]) -> Segment:
+    """action, frames: first and last frame of the action and of the sequence."""
+    return Segment(
+        sequence=sequence,
+        label=label,
+        start=action[0],
+        last=action[1],
+        first_frame=frames[0],
+        last_frame=frames[1],
+    )
+
+
 def test_the_lists_give_their_segments_with_and_without_labels():
     assert parse_segments(TRAIN, "label_split/action_train.txt") == [
-        Segment("subject1/h1/0", 16, 0, 61, 0, 449),
-        Segment("subject1/h1/0", 27, 62, 138, 0, 449),
-        Segment("subject3/k1/7", 36, 5, 99, 0, 120),
+        segment("subject1/h1/0", 16, action=(0, 61), frames=(0, 449)),
+        segment("subject1/h1/0", 27, action=(62, 138), frames=(0, 449)),
+        segment("subject3/k1/7", 36, action=(5, 99), frames=(0, 120)),
     ]
-    assert parse_segments(TEST, "label_split/action_test.txt") == [Segment("subject4/o1/0", None, 30, 75, 0, 599)]
+    assert parse_segments(TEST, "label_split/action_test.txt") == [
+        segment("subject4/o1/0", None, action=(30, 75), frames=(0, 599))
+    ]
 
 
 BAD_LISTS = {
@@ -247,10 +261,10 @@ BAD_LISTS = {
 
 @pytest.mark.parametrize("name", BAD_LISTS)
 def test_a_bad_list_is_named_with_its_line(name):
-    data, where, expected = BAD_LISTS[name]
+    data, location, expected = BAD_LISTS[name]
     with pytest.raises(BadInput) as caught:
         parse_segments(data, "action_x.txt")
-    assert caught.value.where == where
+    assert caught.value.where == location
     assert expected in caught.value.expected
 
 
@@ -318,14 +332,14 @@ def test_a_segment_is_cut_to_the_object_tracked_most_and_split_where_it_changes(
     ]
 
 
-def test_a_segment_without_any_object_is_left_out_with_its_reason(unlabelled, load_all):
+def test_a_segment_without_any_object_is_rejected_with_its_reason(unlabelled, load_all):
     shutil.rmtree(unlabelled / "subject4")
     write_sequence(unlabelled, [0] * 40 + [5] * 40)
     write_list(unlabelled, f"1 {SEQUENCE} 0 39 0 79", f"2 {SEQUENCE} 40 79 0 79", f"3 {SEQUENCE} 45 60 0 79")
-    empty, kept, short = load_all(H2OAdapter(), unlabelled)
+    empty, accepted, short = load_all(H2OAdapter(), unlabelled)
     assert isinstance(empty, Quarantined)
     assert (empty.expected, empty.got) == ("one object for 21 frames or more", "classes [0] (frames 0 to 39)")
-    assert facts([kept]) == [("000040-000079", None, "milk")]
+    assert facts([accepted]) == [("000040-000079", None, "milk")]
     assert (short.where, short.got) == ("label_split/action_test.txt", "16 (frames 45 to 60)")
 
 

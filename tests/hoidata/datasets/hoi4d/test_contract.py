@@ -1,4 +1,4 @@
-"""HOI4D keeps the contract of all adapters; what can be wrong with its files."""
+"""HOI4D passes the tests of all adapters; also the problems its files can have."""
 
 import json
 import pickle
@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from tests.builders import hoi4d
-from tests.builders.hoi4d import ANNOTATIONS, MODELS, SAFE, pickled
-from tests.builders.spoilt import (
+from tests.builders.corruption import (
     FAR_CORNER_OBJ,
     NO_FACE_OBJ,
     Command,
-    Spoil,
+    Corrupt,
     at,
     cut_in_half,
     emptied,
@@ -22,7 +21,8 @@ from tests.builders.spoilt import (
     removed,
     replaced,
 )
-from tests.hoidata.datasets.contract import AdapterContract, Row
+from tests.builders.hoi4d import ANNOTATIONS, MODELS, SAFE, pickled
+from tests.hoidata.datasets.contract import AdapterContract, FileProblem
 
 HAND = f"handpose/refinehandpose_right/{SAFE}/5.pickle"
 POSE, CAMERA = f"{ANNOTATIONS}/{SAFE}/objpose/5.json", f"{ANNOTATIONS}/{SAFE}/3Dseg/output.log"
@@ -30,94 +30,108 @@ EVENTS, FOLDER = f"{ANNOTATIONS}/{SAFE}/action/color.json", f"{MODELS}/articulat
 MESH, HINGE, TREE = f"{FOLDER}/objs/new-1.obj", f"{FOLDER}/mobility_v2.json", f"{FOLDER}/result.json"
 
 
-def edited(path: str, change: Callable[[dict], object]) -> Spoil:
+def edited(path: str, change: Callable[[dict], object]) -> Corrupt:
     """A JSON file, which the builder wrote, with a change."""
 
-    def spoil(root: Path) -> None:
+    def corrupt(root: Path) -> None:
         value = json.loads((root / path).read_text(encoding="utf-8"))
         change(value)
         (root / path).write_text(json.dumps(value), encoding="utf-8")
 
-    return spoil
+    return corrupt
 
 
-def first(change: Callable[[dict], object]) -> Spoil:
+def first(change: Callable[[dict], object]) -> Corrupt:
     """The first part of one frame, with a change."""
     return edited(POSE, lambda value: change(value["dataList"][0]))
 
 
-def hand(**values: object) -> Spoil:
+def hand(**values: object) -> Corrupt:
     whole = {"poseCoeff": np.zeros(48), "beta": np.zeros(10), "trans": np.zeros(3)}
     return holding(HAND, pickled({name: np.asarray(value) for name, value in (whole | values).items()}))
 
 
 class TestHoi4d(AdapterContract):
     name = "hoi4d"
-    spoilt = f"hoi4d/{SAFE}"
+    corrupted_sequence = f"hoi4d/{SAFE}"
     write = staticmethod(hoi4d.write_two)
     bad_settings = {  # noqa: RUF012
         **dict.fromkeys(("margin_frames", "shortest_frames", "most_off_mm", "most_off_deg"), (-1, "0 or more")),
         "clips": ("all", "described or whole"),
     }
     conventions = {  # noqa: RUF012
-        "unit": "test_places_are_metres",
+        "unit": "test_positions_are_metres",
         "handedness of the world": "contract.py::test_the_world_is_not_seen_in_a_mirror",
-        "meshes": "test_a_pose_is_that_of_the_parts_own_mesh",
-        "object rotation": "test_angles_turn_about_x_then_the_turned_y_and_z_and_act_on_columns",
+        "meshes": "test_a_pose_is_that_of_the_mesh_of_the_part",
+        "object rotation": "test_angles_rotate_about_x_then_the_rotated_y_and_z_and_act_on_columns",
         "hand translation": "test_the_translation_is_added_to_the_rest_wrist",
         "finger angles": "test_fingers_are_absolute",
         "shape": "test_the_shape_is_that_of_the_file",
         "left shape directions": "test_left_shape_directions_stay_as_released",
-        "left and right": "contract.py::test_each_hands_numbers_bend_a_hand_of_that_side",
-        "parts": "test_parts_are_told_by_their_size_and_not_by_label",
-        "hinge": "test_the_hinge_turns_by_the_right_hand_about_its_axis_and_is_not_wrapped",
+        "left and right": "contract.py::test_the_numbers_of_each_hand_bend_a_hand_of_that_side",
+        "parts": "test_parts_are_matched_by_their_size_and_not_by_label",
+        "hinge": "test_the_hinge_rotates_by_the_right_hand_rule_about_its_axis_and_is_not_wrapped",
         "camera": "test_the_camera_matrix_takes_camera_to_world_row_by_row",
-        "frames": "test_every_second_frame_is_made_and_the_clock_is_that_of_300_frames",
+        "frames": "test_every_second_frame_is_interpolated_and_the_clock_counts_300_frames",
         "validity": "test_a_hand_is_not_valid_without_a_whole_file",
         "labels": "test_events_are_read_in_both_forms",
         "gravity": "hoi4d/test_hoi4d.py::test_gravity_is_estimated_where_a_mug_stands_on_two_of_its_sides",
     }
 
     @staticmethod
-    def rows() -> Iterable[Row]:
-        yield Row("truncated file", POSE, at(POSE, cut_in_half), "JSON")
-        yield Row("empty file", EVENTS, at(EVENTS, emptied), "an empty file")
-        yield Row("malicious pickle", HAND, holding(HAND, pickle.dumps({"poseCoeff": Command()})), "not allowed")
-        yield Row("NaN", POSE, at(POSE, replaced(b'"x": ', b'"x": NaN, "a": ')), "JSON")
-        yield Row("NaN in a hand", HAND, hand(trans=[np.nan, 0, 0]), "finite")
-        yield Row("infinity", CAMERA, at(CAMERA, replaced(b"0.0 0.0 0.0 1.0", b"0.0 0.0 0.0 inf")), "finite")
-        yield Row("wrong columns", HAND, hand(poseCoeff=np.zeros(49)), "48 columns")
-        yield Row("wrong dtype (words)", POSE, first(lambda part: part["center"].update(x="words")), "numbers")
-        yield Row("missing object file", MESH, removed(MESH), "nothing there")
-        yield Row("frame-count mismatch", "objpose", at(CAMERA, lambda data: _lines(data, 95)), "as output.log has")
-        yield Row("symlink out of the root", POSE, linked_outside(POSE), "link that leaves")
-        yield Row("zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces")
-        yield Row("absurd size (face)", MESH, holding(MESH, FAR_CORNER_OBJ), "face corners")
-        yield Row("absurd size (hand)", HAND, holding(HAND, b"\x80\x02" + bytes(100_000)), "at most 65536 bytes")
+    def file_problems() -> Iterable[FileProblem]:
+        yield FileProblem("truncated file", POSE, at(POSE, cut_in_half), "JSON")
+        yield FileProblem("empty file", EVENTS, at(EVENTS, emptied), "an empty file")
+        yield FileProblem(
+            "malicious pickle", HAND, holding(HAND, pickle.dumps({"poseCoeff": Command()})), "not allowed"
+        )
+        yield FileProblem("NaN", POSE, at(POSE, replaced(b'"x": ', b'"x": NaN, "a": ')), "JSON")
+        yield FileProblem("NaN in a hand", HAND, hand(trans=[np.nan, 0, 0]), "finite")
+        yield FileProblem("infinity", CAMERA, at(CAMERA, replaced(b"0.0 0.0 0.0 1.0", b"0.0 0.0 0.0 inf")), "finite")
+        yield FileProblem("wrong columns", HAND, hand(poseCoeff=np.zeros(49)), "48 columns")
+        yield FileProblem("wrong dtype (words)", POSE, first(lambda part: part["center"].update(x="words")), "numbers")
+        yield FileProblem("missing object file", MESH, removed(MESH), "nothing there")
+        yield FileProblem(
+            "frame-count mismatch", "objpose", at(CAMERA, lambda data: _lines(data, 95)), "as output.log has"
+        )
+        yield FileProblem("symlink out of the root", POSE, linked_outside(POSE), "link that leaves")
+        yield FileProblem("zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces")
+        yield FileProblem("absurd size (face)", MESH, holding(MESH, FAR_CORNER_OBJ), "face corners")
+        yield FileProblem(
+            "absurd size (hand)", HAND, holding(HAND, b"\x80\x02" + bytes(100_000)), "at most 65536 bytes"
+        )
 
     @staticmethod
-    def further_rows() -> Iterable[Row]:
-        yield Row("no trajectory", CAMERA, removed(CAMERA), "expected a file")
-        yield Row("a matrix by columns", "output.log", at(CAMERA, _transposed), "a rotation and a shift")
-        yield Row("a line too few", CAMERA, at(CAMERA, lambda data: _lines(data, 99)), "five lines per frame")
-        yield Row("no events", EVENTS, removed(EVENTS), "expected a file")
-        yield Row(
+    def format_problems() -> Iterable[FileProblem]:
+        yield FileProblem("no trajectory", CAMERA, removed(CAMERA), "expected a file")
+        yield FileProblem("a matrix by columns", "output.log", at(CAMERA, _transposed), "a rotation and a shift")
+        yield FileProblem("a line too few", CAMERA, at(CAMERA, lambda data: _lines(data, 99)), "five lines per frame")
+        yield FileProblem("no events", EVENTS, removed(EVENTS), "expected a file")
+        yield FileProblem(
             "events of no time", EVENTS, edited(EVENTS, lambda value: value["events"][0].pop("endTime")), "endTime"
         )
-        yield Row(
+        yield FileProblem(
             "another clock", EVENTS, edited(EVENTS, lambda value: value["info"].update(duration="long")), "seconds"
         )
-        yield Row("an object that is a list", POSE, holding(POSE, b"[1]"), "a dictionary with")
-        yield Row("no objects", POSE, edited(POSE, lambda value: value["dataList"].clear()), "at least one object")
-        yield Row("no centre", POSE, first(lambda part: part.pop("center")), "'center'")
-        yield Row("a length of 0", POSE, first(lambda part: part["dimensions"].update(height=0)), "above 0")
-        yield Row("other parts", POSE, first(lambda part: part.update(label="lid")), "the parts Safebox, Safedoor")
-        yield Row("a part twice", POSE, edited(POSE, lambda v: v["dataList"].append(v["dataList"][0])), "of its own")
-        yield Row("deep JSON", POSE, holding(POSE, b"[" * 100_000), "JSON")
-        yield Row("code", POSE, holding(POSE, b"__import__('os').system('touch canary')"), "JSON")
-        yield Row("no hinge", HINGE, edited(HINGE, lambda nodes: nodes.pop()), "one base and one part")
-        yield Row("no mesh of a part", HINGE, edited(TREE, lambda tree: tree[0]["children"].pop()), "one mesh for each")
-        yield Row("an axis of no length", HINGE, edited(HINGE, _without_axis), "a direction")
+        yield FileProblem("an object that is a list", POSE, holding(POSE, b"[1]"), "a dictionary with")
+        yield FileProblem(
+            "no objects", POSE, edited(POSE, lambda value: value["dataList"].clear()), "at least one object"
+        )
+        yield FileProblem("no centre", POSE, first(lambda part: part.pop("center")), "'center'")
+        yield FileProblem("a length of 0", POSE, first(lambda part: part["dimensions"].update(height=0)), "above 0")
+        yield FileProblem(
+            "other parts", POSE, first(lambda part: part.update(label="lid")), "the parts Safebox, Safedoor"
+        )
+        yield FileProblem(
+            "a part twice", POSE, edited(POSE, lambda v: v["dataList"].append(v["dataList"][0])), "of its own"
+        )
+        yield FileProblem("deep JSON", POSE, holding(POSE, b"[" * 100_000), "JSON")
+        yield FileProblem("code", POSE, holding(POSE, b"__import__('os').system('touch canary')"), "JSON")
+        yield FileProblem("no hinge", HINGE, edited(HINGE, lambda nodes: nodes.pop()), "one base and one part")
+        yield FileProblem(
+            "no mesh of a part", HINGE, edited(TREE, lambda tree: tree[0]["children"].pop()), "one mesh for each"
+        )
+        yield FileProblem("an axis of no length", HINGE, edited(HINGE, _without_axis), "a direction")
 
 
 def _without_axis(nodes: list) -> None:

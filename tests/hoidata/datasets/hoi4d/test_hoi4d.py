@@ -1,4 +1,4 @@
-"""HOI4D's adapter on recordings written from a known truth, and what becomes of files that are not as they should."""
+"""HOI4D's adapter on recordings written from a ground truth, and on faulty files."""
 
 import json
 from dataclasses import replace
@@ -15,7 +15,7 @@ from hoidata.datasets import RawTree
 from hoidata.datasets.hinge import fit_hinge
 from hoidata.datasets.hoi4d.adapter import Hoi4dAdapter
 from hoidata.datasets.hoi4d.files import EVENTS, action_events, frame_numbers, hinge_joint
-from hoidata.datasets.hoi4d.parts import matched, twice_rotvecs, twice_values
+from hoidata.datasets.hoi4d.parts import match_boxes, upsample_rotvecs, upsample_values
 from hoidata.errors import BadInput
 from hoidata.metrics.bimart import con_everywhere_corrected
 from hoidata.objects.model import Hinge
@@ -56,47 +56,49 @@ def root(tmp_path_factory):
 
 @pytest.mark.parametrize(("name", "seed"), [(SAFE, 0), (SCISSORS, 1), (MUG, 2)])
 def test_a_recording_comes_back_to_its_truth_in_the_world(root, name, seed):
-    made, clip = recording(name, seed), the_clip(load(root, name, clips="whole"))
+    written, clip = recording(name, seed), the_clip(load(root, name, clips="whole"))
     assert clip.n_frames == 2 * N_FRAMES - 1
     assert clip.recorded.tolist() == [True, False] * (N_FRAMES - 1) + [True]
-    seen = clip.take(clip.recorded)
-    assert seen.source_frames.tolist() == list(range(N_FRAMES))
-    for part, mesh in enumerate(made.parts):
+    recorded_clip = clip.take(clip.recorded)
+    assert recorded_clip.source_frames.tolist() == list(range(N_FRAMES))
+    for part, mesh in enumerate(written.parts):
         model = clip.object.model
-        turn = Rotation.from_rotvec(made.axis * made.angle[:, None] * part)
+        rotation = Rotation.from_rotvec(written.axis * written.angle[:, None] * part)
         for frame in range(N_FRAMES):
             rest = mesh.vertices
-            if made.hinged:
+            if written.hinged:
                 assert np.array_equal(model.vertices_m[model.part == part], rest)
-                rest = turn[frame].apply(rest - made.origin) + made.origin
-            else:  # a rigid mesh is about the middle of its own box
-                middle = made.own[0].apply(np.zeros(3))
-                rest = made.own[0].apply(model.vertices_m) + middle
-            truth = rest @ made.pose[frame, :3, :3].T + made.pose[frame, :3, 3]
-            found = seen.object.points_in_world(model.vertices_m, model.part)[frame][model.part == part]
-            assert np.abs(found - truth).max() < 1e-4
-    if made.hinged:
-        assert np.rad2deg(np.abs(seen.object.hinge_rad - made.angle)).max() < 0.1
+                rest = rotation[frame].apply(rest - written.origin) + written.origin
+            else:  # a rigid mesh is centred at its bounding box
+                middle = written.box_rotations[0].apply(np.zeros(3))
+                rest = written.box_rotations[0].apply(model.vertices_m) + middle
+            truth = rest @ written.pose[frame, :3, :3].T + written.pose[frame, :3, 3]
+            result = recorded_clip.object.points_in_world(model.vertices_m, model.part)[frame][model.part == part]
+            assert np.abs(result - truth).max() < 1e-4
+    if written.hinged:
+        assert np.rad2deg(np.abs(recorded_clip.object.hinge_rad - written.angle)).max() < 0.1
     for side in SIDES:
-        orient, fingers, wrist, betas = made.hands[side]
-        valid = seen.hands[side].valid
+        orient, fingers, wrist, betas = written.hands[side]
+        valid = recorded_clip.hands[side].valid
         assert np.flatnonzero(~valid).tolist() == ([MISSING, SHORT] if name == SCISSORS and side == "right" else [])
-        assert np.abs(seen.hands[side].wrist_m - wrist)[valid].max() < 1e-4
-        off = Rotation.from_rotvec(seen.hands[side].global_orient[valid]).inv() * Rotation.from_rotvec(orient[valid])
+        assert np.abs(recorded_clip.hands[side].wrist_m - wrist)[valid].max() < 1e-4
+        off = Rotation.from_rotvec(recorded_clip.hands[side].global_orient[valid]).inv() * Rotation.from_rotvec(
+            orient[valid]
+        )
         assert np.rad2deg(off.magnitude()).max() < 0.1
-        assert np.abs(seen.hands[side].hand_pose[valid] - fingers).max() < 1e-5
-        assert np.abs(seen.hands[side].betas - betas).max() < 1e-5
-    assert np.abs(seen.camera.position_m - made.camera[:, :3, 3]).max() < 1e-5
+        assert np.abs(recorded_clip.hands[side].hand_pose[valid] - fingers).max() < 1e-5
+        assert np.abs(recorded_clip.hands[side].betas - betas).max() < 1e-5
+    assert np.abs(recorded_clip.camera.position_m - written.camera[:, :3, 3]).max() < 1e-5
 
 
 def test_events_become_clips_with_words_and_a_faulty_hand_file_is_listed(root):
     safe = the_clip(load(root, SAFE))
     assert (safe.clip_id, safe.verb, safe.object_words) == (f"hoi4d/{SAFE}/0003-0019", "open", "safe")
     assert (safe.source_frames[0], safe.source_frames[-1], safe.subject) == (3, 18, "H3")
-    found = load(root, SCISSORS)
-    scissors = the_clip(found)
+    result = load(root, SCISSORS)
+    scissors = the_clip(result)
     assert (scissors.verb, scissors.source_frames[0], scissors.source_frames[-1]) == ("cut", 2, 19)
-    (fault,) = (item for item in found if isinstance(item, Quarantined))
+    (fault,) = (item for item in result if isinstance(item, Quarantined))
     assert fault.source_key == f"hoi4d/{SCISSORS}/right-{SHORT:05d}"
     assert (fault.expected, fault.got) == ("48 numbers", "1")
     assert the_clip(load(root, SCISSORS, margin_frames=3)).source_frames[0] == 1
@@ -114,28 +116,28 @@ def test_its_words_make_sentences():
         assert verb.split()[0] in four_sentences(verb, "trash can", "right")[0].lower()
 
 
-def test_made_frames_lie_between_and_no_figure_looks_at_them(root):
+def test_interpolated_frames_are_between_recorded_ones_and_metrics_skip_them(root):
     clip = the_clip(load(root, SAFE, clips="whole"))
-    made = ~clip.recorded
+    interpolated = ~clip.recorded
     still = clip.take(np.repeat(np.flatnonzero(clip.recorded), 2)[:-1])
-    assert np.abs(clip.object.translation_m[made] - still.object.translation_m[made]).max() < 0.02
+    assert np.abs(clip.object.translation_m[interpolated] - still.object.translation_m[interpolated]).max() < 0.02
     pair = build_pair(clip, clip, "both")
     assert pair.frames("left").tolist() == np.flatnonzero(clip.recorded).tolist()
     assert len(con_everywhere_corrected(pair, 1)) == N_FRAMES
     cubic = np.arange(7.0) ** 3
-    assert twice_values(cubic)[3:-3:2] == pytest.approx((np.arange(1, 5) + 0.5) ** 3)
+    assert upsample_values(cubic)[3:-3:2] == pytest.approx((np.arange(1, 5) + 0.5) ** 3)
     valid = np.array([True, True, True, False, True, True, True])
-    assert twice_values(cubic, valid)[3] == (1 + 8) / 2
+    assert upsample_values(cubic, valid)[3] == (1 + 8) / 2
     turns = Rotation.from_rotvec([[0, 0, 3.0], [0, 0, -3.0]]).as_rotvec()  # over pi, the short way
-    assert twice_rotvecs(turns)[1] == pytest.approx([0, 0, np.pi]) or twice_rotvecs(turns)[1][2] == pytest.approx(
+    assert upsample_rotvecs(turns)[1] == pytest.approx([0, 0, np.pi]) or upsample_rotvecs(turns)[1][2] == pytest.approx(
         -np.pi
     )
 
 
 @pytest.mark.parametrize("missing", [(), (9, 10)])
 def test_frames_without_an_object_file_divide_a_clip(root, tmp_path, missing):
-    made = recording(MUG, 4, 40)
-    write_recording(tmp_path, replace(made, events=(("Pickup", 0, 40), ("rest", 3, 9))))
+    written = recording(MUG, 4, 40)
+    write_recording(tmp_path, replace(written, events=(("Pickup", 0, 40), ("rest", 3, 9))))
     for frame in missing:
         (tmp_path / ANNOTATIONS / MUG / f"objpose/{frame}.json").unlink()
     results = load(tmp_path, MUG, shortest_frames=10)
@@ -148,9 +150,9 @@ def test_frames_without_an_object_file_divide_a_clip(root, tmp_path, missing):
 
 
 def test_one_frame_without_an_object_file_is_bridged_and_marked(root, tmp_path):
-    """At 15 frames a second it and the made frames on both sides of it are three frames at 30."""
-    made = recording(MUG, 4, 40)
-    write_recording(tmp_path, replace(made, events=(("Pickup", 0, 40),)))
+    """A missing frame at 15 fps and its two interpolated neighbours are three frames at 30 fps."""
+    written = recording(MUG, 4, 40)
+    write_recording(tmp_path, replace(written, events=(("Pickup", 0, 40),)))
     whole = the_clip(load(tmp_path, MUG))
     (tmp_path / ANNOTATIONS / MUG / "objpose/9.json").unlink()
     clip = the_clip(load(tmp_path, MUG))
@@ -166,28 +168,28 @@ def test_one_frame_without_an_object_file_is_bridged_and_marked(root, tmp_path):
 # --- parts and hinge
 
 
-def test_parts_are_told_by_their_size_and_what_sizes_do_not_tell_is_refused():
+def test_parts_are_matched_by_their_size_and_ambiguous_sizes_are_refused():
     meshes = np.array([[0.3, 0.2, 0.1], [0.28, 0.02, 0.1]])
-    chosen, ratio = matched("here", 1.05 * meshes[::-1], ["a", "b"], meshes)
+    chosen, ratio = match_boxes("here", 1.05 * meshes[::-1], ["a", "b"], meshes)
     assert chosen == [1, 0]
     assert ratio == pytest.approx(1.05 * np.ones((2, 3)))
     for boxes, says in ((1.3 * meshes, "at best 30% off"), (meshes[:1], "none")):
         with pytest.raises(BadInput, match=says):
-            matched("here", boxes, ["a", "b"], meshes)
+            match_boxes("here", boxes, ["a", "b"], meshes)
     with pytest.raises(BadInput, match="cannot be told"):
-        matched("here", meshes[[0, 0]], ["a", "b"], np.array([[0.3, 0.2, 0.1], [0.3, 0.201, 0.1]]))
+        match_boxes("here", meshes[[0, 0]], ["a", "b"], np.array([[0.3, 0.2, 0.1], [0.3, 0.201, 0.1]]))
 
 
 def test_parts_that_drift_off_the_hinge_are_brought_back_and_the_residual_is_kept(tmp_path):
-    """The door is tracked 6 mm off its hinge: half of it stays in the pose of both, 3 mm each."""
+    """The door is tracked 6 mm off its hinge, so the residual is 3 mm for each part."""
     hinge = Hinge(np.array([0, 0, 1.0]), np.zeros(3))
     corners = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
     angle = np.linspace(0, 4, 9)
     base = transforms(Rotation.from_rotvec(np.linspace([0, 0, 0], [0.2, 0.5, 0], 9)), np.zeros((9, 3)))
-    turned = base @ transforms(Rotation.from_rotvec(np.outer(angle, hinge.axis)), np.zeros((9, 3)))
-    off = turned.copy()
+    rotated = base @ transforms(Rotation.from_rotvec(np.outer(angle, hinge.axis)), np.zeros((9, 3)))
+    off = rotated.copy()
     off[:, :3, 3] += 0.006 * base[:, :3, 2]
-    exact, drifted = (fit_hinge(base, moving, hinge, (corners, corners)) for moving in (turned, off))
+    exact, drifted = (fit_hinge(base, moving, hinge, (corners, corners)) for moving in (rotated, off))
     assert exact.residual_m.max() < 1e-9
     assert np.abs(exact.hinge_rad - angle).max() < 1e-9
     assert drifted.residual_m == pytest.approx(np.full(9, 0.003), abs=1e-6)
@@ -198,17 +200,17 @@ def test_parts_that_drift_off_the_hinge_are_brought_back_and_the_residual_is_kep
     assert np.rad2deg(fit_hinge(base, twisted, hinge, (corners, corners)).residual_rad).max() > 1
 
 
-def test_frames_far_off_the_hinge_are_left_out_with_the_reason(tmp_path):
+def test_frames_far_off_the_hinge_are_excluded_with_the_reason(tmp_path):
     write_recording(tmp_path, recording(SAFE, 5))
     path = tmp_path / ANNOTATIONS / SAFE / "objpose/19.json"
     value = json.loads(path.read_text())
     next(entry for entry in value["dataList"] if entry["label"] == "Safedoor")["center"]["x"] += 0.1
     path.write_text(json.dumps(value))
-    found = load(tmp_path, SAFE, clips="whole")
-    assert the_clip(found).source_frames[-1] == 18
-    (reason,) = (item for item in found if isinstance(item, Quarantined))
+    result = load(tmp_path, SAFE, clips="whole")
+    assert the_clip(result).source_frames[-1] == 18
+    (reason,) = (item for item in result if isinstance(item, Quarantined))
     assert (reason.source_key, "1 frames, the first 19" in reason.got) == (f"hoi4d/{SAFE}/hinge", True)
-    assert "; hinge: " in the_clip(found).gravity_note
+    assert "; hinge: " in the_clip(result).gravity_note
 
 
 def test_drawers_and_further_parts_are_refused():
@@ -248,20 +250,20 @@ def test_frames_have_one_file_each_padded_or_not():
 
 
 def test_gravity_is_estimated_where_a_mug_stands_on_two_of_its_sides(tmp_path):
-    """It stands, is lifted, turned onto its side and stands again, and the hands go away from it."""
+    """The object rests, is lifted, rotated onto its side and rests again; the hands leave it."""
     n_frames = 50
-    share = np.clip((np.arange(n_frames) - 18) / 12, 0, 1)
-    turn = Rotation.from_rotvec(np.outer(share * np.pi / 2, [1.0, 0, 0]))
-    height = 0.06 - 0.01 * share + 0.15 * np.sin(np.pi * share)
-    place = np.stack([np.full(n_frames, 0.1), 0.5 + 0.1 * share, height], axis=1)
-    made = recording(MUG, 2, n_frames)
-    near = ((share > 0) & (share < 1))[:, None]
-    wrist = np.where(near, place + np.array([0, 0, 0.12]), (0.8, 0.5, 0.3))
-    waits = {side: (o, f, wrist, b) for side, (o, f, _, b) in made.hands.items()}
-    still = np.tile(made.camera[:1], (n_frames, 1, 1))
+    fraction = np.clip((np.arange(n_frames) - 18) / 12, 0, 1)
+    rotation = Rotation.from_rotvec(np.outer(fraction * np.pi / 2, [1.0, 0, 0]))
+    height = 0.06 - 0.01 * fraction + 0.15 * np.sin(np.pi * fraction)
+    position_m = np.stack([np.full(n_frames, 0.1), 0.5 + 0.1 * fraction, height], axis=1)
+    written = recording(MUG, 2, n_frames)
+    near = ((fraction > 0) & (fraction < 1))[:, None]
+    wrist = np.where(near, position_m + np.array([0, 0, 0.12]), (0.8, 0.5, 0.3))
+    waits = {side: (o, f, wrist, b) for side, (o, f, _, b) in written.hands.items()}
+    still = np.tile(written.camera[:1], (n_frames, 1, 1))
     plain = (Rotation.identity(), Rotation.identity())
-    made = replace(made, pose=transforms(turn, place), hands=waits, own=plain, camera=still)
-    write_recording(tmp_path, made)
+    written = replace(written, pose=transforms(rotation, position_m), hands=waits, box_rotations=plain, camera=still)
+    write_recording(tmp_path, written)
     clip = the_clip(load(tmp_path, MUG, clips="whole"))
     assert clip.gravity is not None, clip.gravity_note
     assert clip.gravity @ [0, 0, -1] > np.cos(np.deg2rad(1))
@@ -275,9 +277,9 @@ def test_cams_lists_are_a_split_of_twenty_recordings():
     assert kinds == {"C9T2", "C11T4"}
 
 
-def test_a_mesh_that_is_not_the_same_turned_and_moved_is_refused(tmp_path):
-    made = recording(SAFE, 6)
-    write_recording(tmp_path, made)
+def test_a_mesh_that_is_not_a_rigidly_moved_copy_is_refused(tmp_path):
+    written = recording(SAFE, 6)
+    write_recording(tmp_path, written)
     path = tmp_path / MODELS / "articulated/Safe/004/objs/new-1-align.obj"
     path.write_text(path.read_text().replace("v ", "v 9", 1).replace("v 9-", "v -9", 1))
     with pytest.raises(BadInput, match="the same mesh, turned and moved"):

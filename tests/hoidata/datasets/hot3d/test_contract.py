@@ -1,13 +1,12 @@
-"""HOT3D keeps the contract of all adapters; what can be wrong with its files."""
+"""HOT3D passes the tests of all adapters; also the problems its files can have."""
 
 import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from tests.builders import hot3d
-from tests.builders.hot3d import ARIA, MUG, OBJECT_HEAD, UMETRACK_FILE
-from tests.builders.spoilt import (
-    Spoil,
+from tests.builders.corruption import (
+    Corrupt,
     at,
     cut_in_half,
     emptied,
@@ -19,7 +18,8 @@ from tests.builders.spoilt import (
     replaced,
     set_in,
 )
-from tests.hoidata.datasets.contract import AdapterContract, Row
+from tests.builders.hot3d import ARIA, MUG, OBJECT_HEAD, UMETRACK_FILE
+from tests.hoidata.datasets.contract import AdapterContract, FileProblem
 
 HAND, OBJECT, META = f"{ARIA}/mano_hand_pose_trajectory.jsonl", f"{ARIA}/dynamic_objects.csv", f"{ARIA}/metadata.json"
 QA, MESH, NAMES = f"{ARIA}/masks/mask_qa_pass.csv", f"assets/{MUG}.glb", "assets/instance.json"
@@ -27,7 +27,7 @@ PROFILE, ANGLES = f"{ARIA}/umetrack_hand_user_profile.json", f"{ARIA}/{UMETRACK_
 RIGHT = ("hand_poses", "1")
 
 
-def line(change: Callable[[dict], object], number: int = 2) -> Spoil:
+def line(change: Callable[[dict], object], number: int = 2) -> Corrupt:
     """One line of the hand file with a change."""
 
     def edit(data: bytes) -> bytes:
@@ -39,7 +39,7 @@ def line(change: Callable[[dict], object], number: int = 2) -> Spoil:
     return at(HAND, edit)
 
 
-def edited(path: str, change: Callable[[dict], object]) -> Spoil:
+def edited(path: str, change: Callable[[dict], object]) -> Corrupt:
     def edit(data: bytes) -> bytes:
         content = json.loads(data)
         change(content)
@@ -48,7 +48,7 @@ def edited(path: str, change: Callable[[dict], object]) -> Spoil:
     return at(path, edit)
 
 
-def cell(text: str, column: int, path: str = OBJECT) -> Spoil:
+def cell(text: str, column: int, path: str = OBJECT) -> Corrupt:
     """The third line of a table with another text in one column."""
 
     def edit(data: bytes) -> bytes:
@@ -60,21 +60,21 @@ def cell(text: str, column: int, path: str = OBJECT) -> Spoil:
     return at(path, edit)
 
 
-def with_umetrack_alone(*spoils: Spoil) -> Spoil:
-    """The first recording has UmeTrack's hands and no others; then it is spoilt."""
+def with_umetrack_alone(*corruptions: Corrupt) -> Corrupt:
+    """Give the first recording UmeTrack's hands only, then corrupt it."""
 
     def write(root: Path) -> None:
         (root / HAND).unlink()
         whole = hot3d.truth("Aria", "umetrack", 0)
         (root / ANGLES).write_text(hot3d.hand_lines(whole, "Aria"))
 
-    return one_after_the_other(write, *spoils)
+    return one_after_the_other(write, *corruptions)
 
 
 class TestHot3d(AdapterContract):
     name = "hot3d"
     slow = True
-    spoilt = f"hot3d/{ARIA}"
+    corrupted_sequence = f"hot3d/{ARIA}"
     write = staticmethod(hot3d.write_two)
     bad_settings = {  # noqa: RUF012
         "margin_frames": (-1, "0 or more"),
@@ -87,77 +87,91 @@ class TestHot3d(AdapterContract):
         "unit": "test_files_are_in_metres_and_the_profile_in_millimetres",
         "handedness of the world": "contract.py::test_the_world_is_not_seen_in_a_mirror",
         "meshes": "test_meshes_are_in_metres_where_their_scene_puts_them",
-        "object rotation": "test_quaternions_have_w_first_and_turn_columns",
+        "object rotation": "test_quaternions_have_w_first_and_rotate_columns",
         "hand translation": "test_the_translation_is_added_to_the_rest_wrist",
         "finger angles": "test_fingers_are_relative_to_the_mean_pose",
         "principal components": "test_fifteen_components_are_weights_of_the_models_first_rows",
         "shape": "test_both_hands_have_the_shape_of_the_file",
         "left shape directions": "test_left_shape_directions_are_corrected",
         "left and right": "test_0_is_the_left_hand_and_1_the_right",
-        "joint order": "test_umetracks_joints_are_put_in_our_order_and_its_right_hand_is_the_mirrored_left",
+        "joint order": "test_umetracks_joints_are_converted_to_hoidatas_order_and_its_right_hand_is_the_mirrored_left",
         "frames": "test_two_times_of_one_aria_frame_are_one_frame_and_rows_are_joined_by_time",
         "validity": "test_a_hand_without_a_row_is_not_valid_there",
-        "gravity": "test_things_fall_along_minus_z_with_either_headset",
+        "gravity": "test_objects_fall_along_minus_z_with_either_headset",
     }
 
     @staticmethod
-    def rows() -> Iterable[Row]:
+    def file_problems() -> Iterable[FileProblem]:
         fat = b'{"timestamp_ns": 1, "hand_poses": [' + b"[]," * 30_000 + b"[]]}\n"
-        yield Row("truncated file", HAND, at(HAND, cut_in_half), "JSON text")
-        yield Row("empty file", OBJECT, at(OBJECT, emptied), "the columns object_uid")
-        yield Row("malicious pickle", HAND, at(HAND, malicious), "JSON text")
-        yield Row("NaN", HAND, at(HAND, replaced(b'"betas": [', b'"betas": [NaN, ')), "JSON text")
-        yield Row("infinity", OBJECT, cell("1e400", 2), "finite")
-        yield Row("wrong columns", HAND, line(set_in(*RIGHT, "pose", value=[0.1] * 45)), "15 numbers, got 45")
-        yield Row("wrong dtype (words)", HAND, line(set_in(*RIGHT, "pose", value="words")), "15 numbers")
-        yield Row("missing object file", MESH, removed(MESH), "nothing there")
-        yield Row("missing object motion", OBJECT, removed(OBJECT), "nothing there")
-        yield Row("non-UTF-8 text", OBJECT, cell("\xff", 0), "an object id of digits")
-        yield Row("symlink out of the root", HAND, linked_outside(HAND), "link that leaves")
-        yield Row("zero-face mesh", MESH, holding(MESH, hot3d.glb(hot3d.box(1), faces=())), "with faces")
-        yield Row("absurd size (line)", HAND, holding(HAND, fat), "a line of at most")
-        yield Row(
+        yield FileProblem("truncated file", HAND, at(HAND, cut_in_half), "JSON text")
+        yield FileProblem("empty file", OBJECT, at(OBJECT, emptied), "the columns object_uid")
+        yield FileProblem("malicious pickle", HAND, at(HAND, malicious), "JSON text")
+        yield FileProblem("NaN", HAND, at(HAND, replaced(b'"betas": [', b'"betas": [NaN, ')), "JSON text")
+        yield FileProblem("infinity", OBJECT, cell("1e400", 2), "finite")
+        yield FileProblem("wrong columns", HAND, line(set_in(*RIGHT, "pose", value=[0.1] * 45)), "15 numbers, got 45")
+        yield FileProblem("wrong dtype (words)", HAND, line(set_in(*RIGHT, "pose", value="words")), "15 numbers")
+        yield FileProblem("missing object file", MESH, removed(MESH), "nothing there")
+        yield FileProblem("missing object motion", OBJECT, removed(OBJECT), "nothing there")
+        yield FileProblem("non-UTF-8 text", OBJECT, cell("\xff", 0), "an object id of digits")
+        yield FileProblem("symlink out of the root", HAND, linked_outside(HAND), "link that leaves")
+        yield FileProblem("zero-face mesh", MESH, holding(MESH, hot3d.glb(hot3d.box(1), faces=())), "with faces")
+        yield FileProblem("absurd size (line)", HAND, holding(HAND, fat), "a line of at most")
+        yield FileProblem(
             "absurd size (header)", MESH, at(MESH, replaced(b'"count": 8, "min"', b'"count":9e5,"min"')), "corners in"
         )
-        yield Row("duplicate ids", OBJECT, at(OBJECT, lambda data: data + data.splitlines()[1]), "twice")
+        yield FileProblem("duplicate ids", OBJECT, at(OBJECT, lambda data: data + data.splitlines()[1]), "twice")
 
     @staticmethod
-    def further_rows() -> Iterable[Row]:
+    def format_problems() -> Iterable[FileProblem]:
         quaternion = line(set_in(*RIGHT, "wrist_xform", "q_wxyz", value=[2.0, 0.0, 0.0, 0.0]))
         wide = hot3d.packed(b'{"asset": {"version": "2.0"}}', b"")
         withheld = one_after_the_other(removed(HAND), removed(PROFILE))
-        yield Row("no hands", HAND, withheld, "nothing to do: of some participants")
-        yield Row("hands of nobody", HAND, holding(HAND, b'{"timestamp_ns": 5, "hand_poses": {}}\n'), "got none")
-        yield Row("a third hand", ":3: hand_poses", line(lambda data: data["hand_poses"].update({"2": 1})), "hands 0")
-        yield Row("a hand that is a list", ":3: hand 1", line(set_in(*RIGHT, value=[])), "a dictionary")
-        yield Row("no betas", ":3: hand 1", line(lambda data: data["hand_poses"]["1"].pop("betas")), "'betas'")
-        yield Row(
+        yield FileProblem("no hands", HAND, withheld, "nothing to do: of some participants")
+        yield FileProblem(
+            "hands of nobody", HAND, holding(HAND, b'{"timestamp_ns": 5, "hand_poses": {}}\n'), "got none"
+        )
+        yield FileProblem(
+            "a third hand", ":3: hand_poses", line(lambda data: data["hand_poses"].update({"2": 1})), "hands 0"
+        )
+        yield FileProblem("a hand that is a list", ":3: hand 1", line(set_in(*RIGHT, value=[])), "a dictionary")
+        yield FileProblem("no betas", ":3: hand 1", line(lambda data: data["hand_poses"]["1"].pop("betas")), "'betas'")
+        yield FileProblem(
             "true for a number", "t_xyz", line(set_in(*RIGHT, "wrist_xform", "t_xyz", value=[True, 1, 1])), "3 nu"
         )
-        yield Row("a time in seconds", "timestamp_ns", line(set_in("timestamp_ns", value=1.5)), "nanoseconds, got 1.5")
-        yield Row("a quaternion of length 2", "right hand", quaternion, "one of length 2")
-        yield Row("a time twice", "left hand", at(HAND, lambda data: data + data.splitlines()[0]), "each time once")
-        yield Row("times of 120 Hz", "times", line(set_in("timestamp_ns", value=56752117188860)), "1/30 s apart")
-        yield Row("an empty line", ":1", at(HAND, lambda data: b"\n" + data), "JSON text")
-        yield Row("a missing column", OBJECT, holding(OBJECT, OBJECT_HEAD.replace("q_wo_w,", "")), "q_wo_w")
-        yield Row("a place beyond the town", OBJECT, cell("1e200", 2), "numbers up to 1000")
-        yield Row("no rows", OBJECT, holding(OBJECT, OBJECT_HEAD + "\n"), "poses of an object")
-        yield Row("too many cells", f"{OBJECT}:3", cell("1,2", 2), "9 cells")
-        yield Row("digits of another script", f"{OBJECT}:3", cell("٣", 2), "numbers")
-        yield Row("an underscore in a number", f"{OBJECT}:3", cell("1_0", 2), "numbers")
-        yield Row("a time in words", f"{OBJECT}:3", cell("now", 1), "nanoseconds")
-        yield Row("an unknown object", NAMES, edited(NAMES, lambda data: data.pop(MUG)), f"the object {MUG}")
-        yield Row("a name with a path", MUG, edited(NAMES, set_in(MUG, "instance_name", value="../mug")), "lower-case")
-        yield Row("objects as a list", NAMES, holding(NAMES, b"[1]"), "a dictionary of objects")
-        yield Row("another headset", META, edited(META, set_in("headset", value="Quest4")), "Aria or Quest3")
-        yield Row("a mask of maybe", f"{QA}:3", cell("maybe", 2, QA), "True or False")
-        yield Row("a scene without mesh", MESH, holding(MESH, wide), "with vertices")
-        yield Row("nobody moves anything", ARIA, at(OBJECT, _far_away), "none in any frame")
-        yield Row("no profile", PROFILE, with_umetrack_alone(removed(PROFILE)), "expected a file")
-        yield Row("a profile of nobody", PROFILE, with_umetrack_alone(holding(PROFILE, b"{}")), "'hand_model'")
-        yield Row("a bone 17", PROFILE, with_umetrack_alone(edited(PROFILE, _bone(17))), "bones 0 to 16")
-        yield Row("half a bone", PROFILE, with_umetrack_alone(edited(PROFILE, _bone(1.5))), "bones 0 to 16")
-        yield Row("an axis of length 2", PROFILE, with_umetrack_alone(edited(PROFILE, _long_axis)), "axes of length 1")
+        yield FileProblem(
+            "a time in seconds", "timestamp_ns", line(set_in("timestamp_ns", value=1.5)), "nanoseconds, got 1.5"
+        )
+        yield FileProblem("a quaternion of length 2", "right hand", quaternion, "one of length 2")
+        yield FileProblem(
+            "a time twice", "left hand", at(HAND, lambda data: data + data.splitlines()[0]), "each time once"
+        )
+        yield FileProblem(
+            "times of 120 Hz", "times", line(set_in("timestamp_ns", value=56752117188860)), "1/30 s apart"
+        )
+        yield FileProblem("an empty line", ":1", at(HAND, lambda data: b"\n" + data), "JSON text")
+        yield FileProblem("a missing column", OBJECT, holding(OBJECT, OBJECT_HEAD.replace("q_wo_w,", "")), "q_wo_w")
+        yield FileProblem("a place beyond the town", OBJECT, cell("1e200", 2), "numbers up to 1000")
+        yield FileProblem("no rows", OBJECT, holding(OBJECT, OBJECT_HEAD + "\n"), "poses of an object")
+        yield FileProblem("too many cells", f"{OBJECT}:3", cell("1,2", 2), "9 cells")
+        yield FileProblem("digits of another script", f"{OBJECT}:3", cell("٣", 2), "numbers")
+        yield FileProblem("an underscore in a number", f"{OBJECT}:3", cell("1_0", 2), "numbers")
+        yield FileProblem("a time in words", f"{OBJECT}:3", cell("now", 1), "nanoseconds")
+        yield FileProblem("an unknown object", NAMES, edited(NAMES, lambda data: data.pop(MUG)), f"the object {MUG}")
+        yield FileProblem(
+            "a name with a path", MUG, edited(NAMES, set_in(MUG, "instance_name", value="../mug")), "lower-case"
+        )
+        yield FileProblem("objects as a list", NAMES, holding(NAMES, b"[1]"), "a dictionary of objects")
+        yield FileProblem("another headset", META, edited(META, set_in("headset", value="Quest4")), "Aria or Quest3")
+        yield FileProblem("a mask of maybe", f"{QA}:3", cell("maybe", 2, QA), "True or False")
+        yield FileProblem("a scene without mesh", MESH, holding(MESH, wide), "with vertices")
+        yield FileProblem("nobody moves anything", ARIA, at(OBJECT, _far_away), "none in any frame")
+        yield FileProblem("no profile", PROFILE, with_umetrack_alone(removed(PROFILE)), "expected a file")
+        yield FileProblem("a profile of nobody", PROFILE, with_umetrack_alone(holding(PROFILE, b"{}")), "'hand_model'")
+        yield FileProblem("a bone 17", PROFILE, with_umetrack_alone(edited(PROFILE, _bone(17))), "bones 0 to 16")
+        yield FileProblem("half a bone", PROFILE, with_umetrack_alone(edited(PROFILE, _bone(1.5))), "bones 0 to 16")
+        yield FileProblem(
+            "an axis of length 2", PROFILE, with_umetrack_alone(edited(PROFILE, _long_axis)), "axes of length 1"
+        )
 
 
 def _bone(value: float) -> Callable[[dict], None]:

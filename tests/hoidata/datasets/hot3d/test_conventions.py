@@ -1,5 +1,5 @@
-"""HOT3D's conventions, one test each: numbers typed here, formulas written out, and the same with the convention the
-other way round, which must be off by more than 5 mm. Neither a writer nor the hand-parameter engine of ours is used."""
+"""HOT3D's conventions, one test each: literal numbers, explicit formulas, and the same with the flipped convention,
+which must be off by more than 5 mm. The formulas use neither a builder nor hoidata's conversion of hand parameters."""
 
 import json
 from dataclasses import replace
@@ -40,7 +40,7 @@ ARIA_NS = (56752108188860, 56752108279673)
 
 
 def turn_of(wxyz) -> Rotation:
-    """Unit, as they are typed with few digits."""
+    """Normalize, because the literals have few digits."""
     return Rotation.from_quat(np.roll(wxyz, -1))
 
 
@@ -48,8 +48,8 @@ def unit(wxyz) -> list[float]:
     return (np.array(wxyz) / np.linalg.norm(wxyz)).tolist()
 
 
-def placed_at(place, frame: int) -> list[float]:
-    return (np.array(place) + frame * np.array([STEP_M, 0.0, 0.0])).tolist()
+def placed_at(position_m, frame: int) -> list[float]:
+    return (np.array(position_m) + frame * np.array([STEP_M, 0.0, 0.0])).tolist()
 
 
 def times(frame: int, headset: str = "Aria") -> tuple[int, ...]:
@@ -64,19 +64,19 @@ def hand(side: str, frame: int, pose=None, quaternion=None, transl=None) -> dict
 
 
 def lines(headset: str = "Aria", hands=hand) -> list[dict]:
-    """The second time of a frame has its hands 0.02 mm further."""
-    found = []
+    """At the second time of a frame the hands are 0.02 mm further."""
+    actual = []
     for frame in range(N_FRAMES):
         for late, time in enumerate(times(frame, headset)):
             poses = {str(number): hands(side, frame + 0.002 * late) for number, side in enumerate(SIDES)}
-            found.append({"timestamp_ns": time, "hand_poses": poses})
-    return found
+            actual.append({"timestamp_ns": time, "hand_poses": poses})
+    return actual
 
 
-def rows(headset: str = "Aria", quaternion=BOX_QUATERNION, place=BOX_M) -> list[str]:
+def rows(headset: str = "Aria", quaternion=BOX_QUATERNION, position_m=BOX_M) -> list[str]:
     numbers = unit(quaternion)
     return [
-        ",".join([UID, str(time), *map(repr, placed_at(place, frame)), *map(repr, numbers)])
+        ",".join([UID, str(time), *map(repr, placed_at(position_m, frame)), *map(repr, numbers)])
         for frame in range(N_FRAMES)
         for time in times(frame, headset)
     ]
@@ -108,7 +108,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
 
 
 def hot3d_joints(side: str, hands, model=None, **other) -> np.ndarray:
-    """(16, 3) joints as HOT3D means its numbers: 15 weights and the mean, turned about J0, then moved."""
+    """(16, 3) joints by HOT3D's convention: 15 components plus mean pose, rotated about J0, then translated."""
     model = model or hands[side]
     rest = rest_points(model, other.get("betas", BETAS))
     bends = other.get("bends", model.mean_pose + np.array(POSE[side]) @ model.components[:15])
@@ -120,8 +120,8 @@ def hot3d_joints(side: str, hands, model=None, **other) -> np.ndarray:
 @pytest.mark.parametrize("side", SIDES)
 class TestHands:
     def test_the_translation_is_added_to_the_rest_wrist(self, clip, hands, side):
-        found = joints_as_stored(clip.hands[side], hands[side], AT)
-        agrees(found, hot3d_joints(side, hands), hot3d_joints(side, hands, is_the_wrist=True))
+        actual = joints_as_stored(clip.hands[side], hands[side], AT)
+        agrees(actual, hot3d_joints(side, hands), hot3d_joints(side, hands, is_the_wrist=True))
 
     def test_quaternions_of_hands_have_w_first(self, clip, hands, side):
         last = hot3d_joints(side, hands, quaternion=np.roll(QUATERNION[side], 1))
@@ -144,46 +144,48 @@ class TestHands:
 
 
 def test_0_is_the_left_hand_and_1_the_right(clip, hands):
-    """Components of both sides are mirrored: fingers do not tell sides apart, places and turns do."""
+    """Components of both sides are mirrored, so positions and rotations distinguish the sides, not fingers."""
     for side, other in (SIDES, SIDES[::-1]):
         swapped = hot3d_joints(other, hands, model=hands[side])
         agrees(joints_as_stored(clip.hands[side], hands[side], AT), hot3d_joints(side, hands), swapped)
 
 
 def test_left_shape_directions_are_corrected(hands, tmp_path):
-    """With a MANO_LEFT as released, whose x directions have the wrong sign: the makers' loader turns them."""
+    """With a MANO_LEFT as released, whose x directions have the wrong sign, which the authors' loader corrects."""
     wrong = np.array(hands.left.shape_directions)
-    wrong[:, 0] *= -1  # the embedded hand is right already
+    wrong[:, 0] *= -1  # the embedded hand is already corrected
     released = replace(hands, left=replace(hands.left, shape_directions=wrong))
     chosen = hands_for(Hot3dAdapter().hand_convention, released)
-    found = joints_as_stored(load(write(tmp_path), chosen).hands["left"], chosen.left, AT)
-    agrees(found, hot3d_joints("left", hands), hot3d_joints("left", hands, model=released.left))
+    actual = joints_as_stored(load(write(tmp_path), chosen).hands["left"], chosen.left, AT)
+    agrees(actual, hot3d_joints("left", hands), hot3d_joints("left", hands, model=released.left))
 
 
 def corners(track) -> np.ndarray:
     return (track.world_from_object @ track.model.vertices_m)[AT]
 
 
-def expected_corners(turn=None, place=None, node=True, corners_m=CORNERS) -> np.ndarray:
+def expected_corners(rotation=None, position_m=None, node=True, corners_m=CORNERS) -> np.ndarray:
     points = np.array(corners_m)
     if node:
         points = Rotation.from_quat(NODE["rotation"]).apply(points) + NODE["translation"]
-    found = (turn or turn_of(BOX_QUATERNION)).apply(points) + (placed_at(BOX_M, AT) if place is None else place)
-    return in_order(found)
+    actual = (rotation or turn_of(BOX_QUATERNION)).apply(points) + (
+        placed_at(BOX_M, AT) if position_m is None else position_m
+    )
+    return in_order(actual)
 
 
 def in_order(points) -> np.ndarray:
-    """Rows by their x: a mesh's vertices may come in another order than the file's."""
+    """Sort rows by x, because the order of a mesh's vertices may differ from the file's."""
     return np.array(sorted(np.asarray(points).tolist()))
 
 
 def test_meshes_are_in_metres_where_their_scene_puts_them(clip):
-    found = in_order(corners(clip.object))
+    actual = in_order(corners(clip.object))
     millimetres = expected_corners(corners_m=np.array(CORNERS) / 1000)
-    agrees(found, expected_corners(), expected_corners(node=False), millimetres)
+    agrees(actual, expected_corners(), expected_corners(node=False), millimetres)
 
 
-def test_quaternions_have_w_first_and_turn_columns(clip):
+def test_quaternions_have_w_first_and_rotate_columns(clip):
     by_rows, last = turn_of(BOX_QUATERNION).inv(), turn_of(np.roll(BOX_QUATERNION, 1))
     agrees(in_order(corners(clip.object)), expected_corners(), expected_corners(by_rows), expected_corners(last))
 
@@ -202,72 +204,72 @@ def umetrack_joints(side: str) -> np.ndarray:
     wrist = {"t_xyz": WRIST_M, "q_wxyz": unit(WRIST_QUATERNION)}
     pose = {"wrist_xform": wrist, "joint_angles": [*ANGLES, 0.7, -0.7], "hand_confidence": 1.0}
     line = {"timestamp_ns": 1, "hand_poses": {str(SIDES.index(side)): pose}}
-    (own,) = files.hand_poses(json.dumps(line).encode(), "u.jsonl", "umetrack").values()
+    (poses,) = files.hand_poses(json.dumps(line).encode(), "u.jsonl", "umetrack").values()
     profile = sources.parse_profile(json.dumps(hot3d.profile()).encode(), "profile.json")
-    return sources.joints_m(profile, own, side)[0]
+    return sources.joints_m(profile, poses, side)[0]
 
 
 def hot3d_hand(side: str) -> np.ndarray:
-    """(21, 3) by another formula, bone by bone: bent from the wrist, which itself is where the file says."""
+    """(21, 3) by an independent formula, bone by bone from the wrist position of the file."""
     return turn_of(WRIST_QUATERNION).apply(hot3d.umetrack_joints(side, ANGLES)) + WRIST_M
 
 
 @pytest.mark.parametrize("side", SIDES)
-def test_umetracks_joints_are_put_in_our_order_and_its_right_hand_is_the_mirrored_left(side):
-    """The two angles of the wrist that end a row are not used; the base of the thumb is not told."""
-    found, expected = umetrack_joints(side), hot3d_hand(side)
-    assert np.isnan(found[13]).all()
-    known = np.arange(21) != 13
+def test_umetracks_joints_are_converted_to_hoidatas_order_and_its_right_hand_is_the_mirrored_left(side):
+    """The last two angles, of the wrist, are unused; the file has no base of the thumb."""
+    actual, expected = umetrack_joints(side), hot3d_hand(side)
+    assert np.isnan(actual[13]).all()
+    has_joint = np.arange(21) != 13
     other = hot3d_hand("left" if side == "right" else "right")
     ring_before_pinky = expected[[*range(7), 10, 11, 12, 7, 8, 9, *range(13, 21)]]
-    agrees(found[known], expected[known], other[known], ring_before_pinky[known])
+    agrees(actual[has_joint], expected[has_joint], other[has_joint], ring_before_pinky[has_joint])
     thumb_first = expected[[*range(16), 20, 16, 17, 18, 19]]
-    assert off_m(found[known], thumb_first[known]) > WRONG_M
+    assert off_m(actual[has_joint], thumb_first[has_joint]) > WRONG_M
     joint_added = expected + hot3d.umetrack_rest_m()[4]
-    assert off_m(found[0], WRIST_M) < EXACT_M < WRONG_M < off_m(found[known], joint_added[known])
+    assert off_m(actual[0], WRIST_M) < EXACT_M < WRONG_M < off_m(actual[has_joint], joint_added[has_joint])
 
 
 def test_two_times_of_one_aria_frame_are_one_frame_and_rows_are_joined_by_time(tmp_path, hands):
-    """Of the two the first is kept; rows come in any order, and one of the object has its late time only."""
+    """The first of two times counts. Rows are unordered, and one row of the object has only the second time."""
     shuffled = np.random.default_rng(0).permutation(2 * N_FRAMES)
     tables = [np.array(table, dtype=object)[shuffled].tolist() for table in (lines(), rows())]
     lost = next(index for index, row in enumerate(tables[1]) if f",{times(20)[0]}," in row)
     del tables[1][lost]
-    found = load(write(tmp_path, hands=tables[0], objects=tables[1]))
-    assert found.source_frames.tolist() == list(range(N_FRAMES))
+    actual = load(write(tmp_path, hands=tables[0], objects=tables[1]))
+    assert actual.source_frames.tolist() == list(range(N_FRAMES))
     for side in SIDES:
         steps = np.arange(N_FRAMES)[:, None] * (STEP_M, 0, 0)
-        places = rest_points(hands[side], BETAS)[0] + TRANSL[side] + steps
-        agrees(found.hands[side].wrist_m, places, places[shuffled[shuffled < N_FRAMES]])
-    places = np.array(BOX_M) + np.arange(N_FRAMES)[:, None] * (STEP_M, 0, 0)
-    assert off_m(found.object.translation_m, places) < EXACT_M
+        positions_m = rest_points(hands[side], BETAS)[0] + TRANSL[side] + steps
+        agrees(actual.hands[side].wrist_m, positions_m, positions_m[shuffled[shuffled < N_FRAMES]])
+    positions_m = np.array(BOX_M) + np.arange(N_FRAMES)[:, None] * (STEP_M, 0, 0)
+    assert off_m(actual.object.translation_m, positions_m) < EXACT_M
 
 
 def test_a_hand_without_a_row_is_not_valid_there(tmp_path):
     missing = lines()
     for line in missing[2 * AT : 2 * AT + 2]:
         del line["hand_poses"]["0"]
-    found = load(write(tmp_path, hands=missing))
-    assert np.flatnonzero(~found.hands["left"].valid).tolist() == [AT]
-    assert found.hands["right"].valid.all()
+    actual = load(write(tmp_path, hands=missing))
+    assert np.flatnonzero(~actual.hands["left"].valid).tolist() == [AT]
+    assert actual.hands["right"].valid.all()
 
 
 @pytest.mark.parametrize(("headset", "down"), [("Aria", (0, 0, -1)), ("Quest3", (0, -1, 0))])
-def test_things_fall_along_minus_z_with_either_headset(tmp_path, hands, headset, down):
-    """Quest 3's world has y up: its clips are turned, and the way back is kept."""
-    found = load(write(tmp_path, headset))
-    assert found.gravity.tolist() == [0.0, 0.0, -1.0]
-    np.testing.assert_allclose(found.source_from_world[:3, :3] @ found.gravity, down, atol=1e-12)
-    back = found.source_from_world[:3, :3]
-    agrees(in_order(corners(found.object) @ back.T), expected_corners())
+def test_objects_fall_along_minus_z_with_either_headset(tmp_path, hands, headset, down):
+    """Quest 3's world has y up: its clips are rotated, and source_from_world restores it."""
+    actual = load(write(tmp_path, headset))
+    assert actual.gravity.tolist() == [0.0, 0.0, -1.0]
+    np.testing.assert_allclose(actual.source_from_world[:3, :3] @ actual.gravity, down, atol=1e-12)
+    back = actual.source_from_world[:3, :3]
+    agrees(in_order(corners(actual.object) @ back.T), expected_corners())
     for side in SIDES:
-        agrees(joints_as_stored(found.hands[side], hands[side], AT) @ back.T, hot3d_joints(side, hands))
+        agrees(joints_as_stored(actual.hands[side], hands[side], AT) @ back.T, hot3d_joints(side, hands))
 
 
 class TestSeatedPerson(SeatedPersonContract):
     @pytest.fixture
     def look(self, tmp_path, hands):
-        """Joints of both hands and three edges in the world, of a person whose numbers are given; a turn of columns."""
+        """Joints of both hands and three edges in the world, of a person of known pose."""
 
         def of(person):
             def numbers(side, frame):
@@ -277,16 +279,16 @@ class TestSeatedPerson(SeatedPersonContract):
                 quaternion = np.roll(Rotation.from_rotvec(orient).as_quat(), 1).tolist()
                 return hand(side, frame, pose, quaternion, list(transl))
 
-            # The first edge is held in its middle: a wrist that is a few centimetres off along it still touches.
+            # The hand grasps the middle of the first edge: a wrist a few centimetres off along the edge still touches.
             points = np.array([[0.3, 0.0, 0.0], [-0.3, 0.0, 0.0], [0.3, 0.08, 0.0], [0.3, 0.0, 0.05]]) * person.signs
-            place = np.array(person.hands["right"][2]) + rest_points(hands.right)[0]
+            position_m = np.array(person.hands["right"][2]) + rest_points(hands.right)[0]
             quaternion = np.roll(Rotation.from_rotvec(person.object_orient).as_quat(), 1)
             mesh = hot3d.glb(points, FACES)
-            raw = write(tmp_path, hands=lines(hands=numbers), objects=rows("Aria", quaternion, place), mesh=mesh)
-            seen = load(raw)
-            model = seen.object.model
+            raw = write(tmp_path, hands=lines(hands=numbers), objects=rows("Aria", quaternion, position_m), mesh=mesh)
+            clip = load(raw)
+            model = clip.object.model
             order = [int(np.linalg.norm(model.vertices_m - point, axis=1).argmin()) for point in points]
-            box = corners(seen.object)[order]
-            return {side: joints_as_stored(seen.hands[side], hands[side], AT) for side in SIDES}, box[1:4] - box[0]
+            box = corners(clip.object)[order]
+            return {side: joints_as_stored(clip.hands[side], hands[side], AT) for side in SIDES}, box[1:4] - box[0]
 
         return of

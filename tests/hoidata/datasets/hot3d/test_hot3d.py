@@ -1,4 +1,4 @@
-"""HOT3D's adapter on recordings of a known truth: intervals, what the makers checked, UmeTrack's hands, licences."""
+"""HOT3D's adapter on recordings of a ground truth: intervals, the authors' check, UmeTrack's hands, licences."""
 
 import json
 import shutil
@@ -13,7 +13,7 @@ from hoidata.clips.clip import SIDES, Clip
 from hoidata.clips.validation import check_clip
 from hoidata.conformance.check import check_adapter
 from hoidata.conversion.convert import convert_dataset
-from hoidata.dataset_folders import BUILT_IN, facts_beside
+from hoidata.dataset_folders import BUILT_IN, facts_of_adapter
 from hoidata.datasets import Quarantined, RawTree, SequenceKey
 from hoidata.datasets.hot3d.adapter import Hot3dAdapter
 from hoidata.datasets.hot3d.files import NOUNS, object_words
@@ -24,9 +24,9 @@ from pipelines.exports.describe import Description, dataset_card
 from pipelines.exports.licences import licences_of
 from pipelines.exports.motion import WORLD
 from tests.builders import hot3d
+from tests.builders.corruption import replaced
 from tests.builders.formulas import chain, rest_points
 from tests.builders.hot3d import ARIA, HANDS, KEYBOARD, MUG, N_FRAMES, QUEST, UMETRACK
-from tests.builders.spoilt import replaced
 
 MASK = f"{ARIA}/masks/mask_qa_pass.csv"
 
@@ -52,26 +52,30 @@ def edit_rows(root: Path, change: Callable[[int, list[str]], list[str] | None], 
     head, *lines = path.read_text().splitlines()
     frame_of = {str(time): frame for frame, times in enumerate(hot3d.times("Aria")) for time in times}
     cells = [line.split(",") for line in lines]
-    kept = [change(frame_of[row[1]], row) if row[0] == uid else row for row in cells]
-    path.write_text("\n".join([head, *(",".join(row) for row in kept if row)]))
+    edited_cells = [
+        change(frame_of[row_cells[1]], row_cells) if row_cells[0] == uid else row_cells for row_cells in cells
+    ]
+    path.write_text("\n".join([head, *(",".join(row_cells) for row_cells in edited_cells if row_cells)]))
 
 
-def away(row: list[str]) -> list[str]:
-    return [*row[:2], "7.0", *row[3:]]
+def away(cells: list[str]) -> list[str]:
+    return [*cells[:2], "7.0", *cells[3:]]
 
 
 @pytest.mark.parametrize(("name", "headset", "seed"), [(ARIA, "Aria", 0), (QUEST, "Quest3", 1)])
 def test_a_recording_comes_back_to_its_truth(root: Path, name: str, headset: str, seed: int) -> None:
-    """Joints and object of every frame, within 0.1 mm of what was planted, whatever world the headset has."""
+    """Joints and object of every frame, within 0.1 mm of the ground truth, for the world of either headset."""
     clip, truth = only_clip(root, name), hot3d.truth(headset, "mano", seed)
     for side in SIDES:
-        numbers, turn, place = truth.hands[side]
+        numbers, rotation, position_m = truth.hands[side]
         rest = rest_points(HANDS[side], numbers["betas"])
         bends = HANDS[side].mean_pose + np.array(numbers["pose"]) @ HANDS[side].components[:15]
-        planted = [chain(rest, turn[frame].as_rotvec(), bends, place[frame]) for frame in range(N_FRAMES)]
+        planted = [chain(rest, rotation[frame].as_rotvec(), bends, position_m[frame]) for frame in range(N_FRAMES)]
         assert np.abs(track_joints(clip.hands[side], HANDS[side])[:, :16] - planted).max() < 1e-4
     box = hot3d.box(hot3d.HALF_BOX_M)
-    planted = [turn.apply(box) + place for turn, place in zip(truth.turn, truth.place, strict=True)]
+    planted = [
+        rotation.apply(box) + position_m for rotation, position_m in zip(truth.rotation, truth.position_m, strict=True)
+    ]
     order = [int(np.linalg.norm(clip.object.model.vertices_m - corner, axis=1).argmin()) for corner in box]
     assert np.abs((clip.object.world_from_object @ clip.object.model.vertices_m)[:, order] - planted).max() < 1e-4
 
@@ -90,23 +94,23 @@ def test_every_object_of_the_makers_has_words() -> None:
     assert all(words == object_words(name) and not any(map(str.isdigit, words)) for name, words in NOUNS.items())
 
 
-def test_a_clip_names_the_files_it_was_made_from(root: Path) -> None:
-    own = [f"{ARIA}/{name}" for name in ("dynamic_objects.csv", hot3d.MANO_FILE, "metadata.json")]
+def test_a_clip_names_its_source_files(root: Path) -> None:
+    recording_files = [f"{ARIA}/{name}" for name in ("dynamic_objects.csv", hot3d.MANO_FILE, "metadata.json")]
     shared = ["assets/instance.json", *(f"assets/{uid}.glb" for uid in (MUG, KEYBOARD))]
-    assert [source.path for source in only_clip(root).sources] == sorted([*own, *shared, MASK])
+    assert [source.path for source in only_clip(root).sources] == sorted([*recording_files, *shared, MASK])
 
 
 def test_an_interval_begins_and_ends_with_the_touch_and_a_margin_widens_it(root: Path) -> None:
-    edit_rows(root, lambda frame, row: row if 2 <= frame < 34 else away(row))
+    edit_rows(root, lambda frame, cells: cells if 2 <= frame < 34 else away(cells))
     assert only_clip(root).source_frames.tolist() == list(range(2, 34))
     assert only_clip(root, margin_frames=1).source_frames.tolist() == list(range(1, 35))
     assert only_clip(root, margin_frames=99).n_frames == N_FRAMES
 
 
 def test_a_gap_of_ten_frames_without_touch_is_part_of_it_and_one_of_eleven_is_not(root: Path) -> None:
-    edit_rows(root, lambda frame, row: away(row) if 12 <= frame < 22 else row)
+    edit_rows(root, lambda frame, cells: away(cells) if 12 <= frame < 22 else cells)
     assert only_clip(root).n_frames == N_FRAMES
-    edit_rows(root, lambda frame, row: away(row) if 12 <= frame < 23 else row)
+    edit_rows(root, lambda frame, cells: away(cells) if 12 <= frame < 23 else cells)
     clips = load(root, shortest_frames=12)
     assert [clip.source_frames[[0, -1]].tolist() for clip in clips if isinstance(clip, Clip)] == [[0, 11], [23, 35]]
 
@@ -116,7 +120,7 @@ def test_long_intervals_are_divided_evenly(root: Path) -> None:
     assert [clip.n_frames for clip in clips if isinstance(clip, Clip)] == [12, 12, 12]
 
 
-def test_frames_that_the_makers_refused_are_left_out_and_counted(root: Path) -> None:
+def test_frames_that_failed_the_authors_check_are_excluded_and_counted(root: Path) -> None:
     (root / MASK).write_text(hot3d.mask_table(hot3d.truth("Aria", "mano", 0), "Aria", {2: "1201-2", 3: "214-1"}))
     failed, short, clip = load(root)
     assert isinstance(clip, Clip)
@@ -130,33 +134,35 @@ def test_frames_that_the_makers_refused_are_left_out_and_counted(root: Path) -> 
 
 
 def without_times(root: Path, frames: range) -> None:
-    """No file has anything in these frames."""
+    """Remove these frames from all files."""
     hands = root / ARIA / hot3d.MANO_FILE
     lines = hands.read_text().splitlines(keepends=True)
     hands.write_text("".join([*lines[: 2 * frames.start], *lines[2 * frames.stop :]]))
     for uid in (MUG, KEYBOARD):
-        edit_rows(root, lambda frame, row: None if frame in frames else row, uid)
+        edit_rows(root, lambda frame, cells: None if frame in frames else cells, uid)
 
 
 def test_frames_without_the_object_and_times_that_are_missing_end_an_interval(root: Path) -> None:
-    edit_rows(root, lambda frame, row: None if 32 <= frame < 36 else row)
+    edit_rows(root, lambda frame, cells: None if 32 <= frame < 36 else cells)
     assert [clip.n_frames for clip in load(root) if isinstance(clip, Clip)] == [32]
     without_times(root, range(28, 32))
     assert [clip.n_frames for clip in load(root, shortest_frames=20) if isinstance(clip, Clip)] == [28]
 
 
-def close_to_truth(clip: Clip, made: list[int]) -> None:
-    """Made frames are marked, and their object is where it was; the truth moves evenly."""
+def close_to_truth(clip: Clip, interpolated: list[int]) -> None:
+    """Interpolated frames are marked and close to the ground truth, which moves evenly."""
     truth = hot3d.truth("Aria", "mano", 0)
-    assert np.flatnonzero(~clip.recorded).tolist() == made
-    assert np.abs(clip.object.translation_m[made] - truth.place[made]).max() < 1e-4
-    turned = np.linalg.norm((np.array([t.as_rotvec() for t in truth.turn]) - clip.object.rotvec)[made], axis=1)
-    assert np.rad2deg(turned.max()) < 1
+    assert np.flatnonzero(~clip.recorded).tolist() == interpolated
+    assert np.abs(clip.object.translation_m[interpolated] - truth.position_m[interpolated]).max() < 1e-4
+    rotated = np.linalg.norm(
+        (np.array([t.as_rotvec() for t in truth.rotation]) - clip.object.rotvec)[interpolated], axis=1
+    )
+    assert np.rad2deg(rotated.max()) < 1
 
 
 def test_short_gaps_in_the_objects_poses_are_bridged_and_marked(root: Path) -> None:
     gaps = {9, 19, 20, 29, 30, 31}
-    edit_rows(root, lambda frame, row: None if frame in gaps else row)
+    edit_rows(root, lambda frame, cells: None if frame in gaps else cells)
     clip = only_clip(root)
     close_to_truth(clip, sorted(gaps))
     assert clip.n_frames == N_FRAMES
@@ -172,7 +178,7 @@ def test_frames_that_no_file_has_are_added_where_three_or_fewer_are_lost(root: P
 
 
 def test_a_long_gap_is_reported_as_missing_poses_and_not_as_short_touches(root: Path) -> None:
-    edit_rows(root, lambda frame, row: None if 12 <= frame < 20 else row)
+    edit_rows(root, lambda frame, cells: None if 12 <= frame < 20 else cells)
     missing, cut = load(root)
     assert isinstance(missing, Quarantined)
     assert missing.source_key == f"hot3d/{ARIA}/mug_white/missing"
@@ -185,7 +191,7 @@ def test_a_long_gap_is_reported_as_missing_poses_and_not_as_short_touches(root: 
     assert cut.got == "2 others, 28 frames, the first frame 0"
 
 
-def test_a_hand_that_is_lost_while_it_holds_is_named_too(root: Path) -> None:
+def test_a_hand_that_is_lost_during_contact_is_reported_too(root: Path) -> None:
     lines = (root / ARIA / hot3d.MANO_FILE).read_text().splitlines()
     lost = [json.dumps({**json.loads(line), "hand_poses": {}}) for line in lines[24:48]]
     (root / ARIA / hot3d.MANO_FILE).write_text("\n".join([*lines[:24], *lost, *lines[48:]]))
@@ -195,26 +201,26 @@ def test_a_hand_that_is_lost_while_it_holds_is_named_too(root: Path) -> None:
 
 
 def test_a_clip_begins_and_ends_with_a_recorded_frame(root: Path) -> None:
-    edit_rows(root, lambda frame, row: None if frame in (17, 18) else row)
+    edit_rows(root, lambda frame, cells: None if frame in (17, 18) else cells)
     clips = [clip for clip in load(root, longest_frames=18) if isinstance(clip, Clip)]
     assert [clip.source_frames[[0, -1]].tolist() for clip in clips] == [[0, 16], [19, 35]]
 
 
-def test_another_object_is_beside_a_clip_only_where_it_is_known_throughout(root: Path) -> None:
-    edit_rows(root, lambda frame, row: None if frame == 9 else row, KEYBOARD)
+def test_a_clip_has_another_object_only_if_it_is_tracked_throughout(root: Path) -> None:
+    edit_rows(root, lambda frame, cells: None if frame == 9 else cells, KEYBOARD)
     clip = only_clip(root)
     assert np.flatnonzero(~clip.recorded).tolist() == [9]
     assert len(clip.other_objects) == 1
-    edit_rows(root, lambda frame, row: None if 9 <= frame < 13 else row, KEYBOARD)
+    edit_rows(root, lambda frame, cells: None if 9 <= frame < 13 else cells, KEYBOARD)
     assert next(item for item in load(root) if isinstance(item, Clip)).other_objects == ()
 
 
 def test_an_object_that_is_touched_and_does_not_move_gives_no_clip(root: Path) -> None:
     still = (root / ARIA / "dynamic_objects.csv").read_text().splitlines()[1].split(",")[2:]
-    edit_rows(root, lambda frame, row: [*row[:2], *still])
+    edit_rows(root, lambda frame, cells: [*cells[:2], *still])
     hands = [json.loads(line) for line in (root / ARIA / hot3d.MANO_FILE).read_text().splitlines()]
-    held = [json.dumps({**line, "hand_poses": hands[0]["hand_poses"]}) for line in hands]
-    (root / ARIA / hot3d.MANO_FILE).write_text("\n".join(held))
+    still_hands = [json.dumps({**line, "hand_poses": hands[0]["hand_poses"]}) for line in hands]
+    (root / ARIA / hot3d.MANO_FILE).write_text("\n".join(still_hands))
     (item,) = load(root)
     assert isinstance(item, Quarantined)
     assert (item.source_key, item.expected) == (f"hot3d/{ARIA}/mug_white/still", "an object that moves 2 cm")
@@ -227,7 +233,7 @@ def load_packed(root: Path, **settings) -> list[Clip | Quarantined]:
     return Hot3dAdapter(**settings).load(RawTree(root), PACKED, HANDS)
 
 
-def test_a_clip_of_hot3d_clips_says_what_its_recording_does(root: Path, tmp_path: Path) -> None:
+def test_a_clip_of_hot3d_clips_equals_its_recording(root: Path, tmp_path: Path) -> None:
     """The same truth packed into a tar: the same motion, of the participant of the recording."""
     hot3d.write_clip(tmp_path / "clips", "Quest3", 1849, QUEST, hot3d.truth("Quest3", "mano", 1))
     assert Hot3dAdapter().sequences(tmp_path / "clips") == [PACKED]
@@ -238,8 +244,8 @@ def test_a_clip_of_hot3d_clips_says_what_its_recording_does(root: Path, tmp_path
     assert (clip.sequence, clip.subject, clip.object_words) == (PACKED.name, "P0002", "white mug")
     assert np.flatnonzero(~clip.hands["left"].valid).tolist() == [5]
     for side in SIDES:
-        own = [track_joints(item.hands[side], HANDS[side])[clip.hands[side].valid] for item in (clip, whole)]
-        assert np.abs(own[0] - own[1]).max() < 1e-5
+        joints_m = [track_joints(item.hands[side], HANDS[side])[clip.hands[side].valid] for item in (clip, whole)]
+        assert np.abs(joints_m[0] - joints_m[1]).max() < 1e-5
     np.testing.assert_allclose(clip.object.translation_m, whole.object.translation_m, atol=1e-6)
     np.testing.assert_allclose(clip.object.rotvec, whole.object.rotvec, atol=1e-5)
     np.testing.assert_array_equal(clip.source_from_world, whole.source_from_world)
@@ -283,7 +289,7 @@ def test_a_clip_of_hot3d_clips_without_manos_numbers_gets_fitted_hands(tmp_path:
         ("object_models_eval/obj_000009.glb", lambda data: b"", "a readable mesh"),
     ],
 )
-def test_a_spoilt_clip_of_hot3d_clips_is_named(tmp_path: Path, packed_root: Path, path, change, message) -> None:
+def test_a_corrupted_clip_of_hot3d_clips_is_named(tmp_path: Path, packed_root: Path, path, change, message) -> None:
     root = shutil.copytree(packed_root, tmp_path / "clips")
     (root / path).write_bytes(change((root / path).read_bytes()))
     with pytest.raises(BadInput, match=message) as caught:
@@ -308,15 +314,15 @@ def umetrack_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_a_recording_with_umetracks_hands_alone_gets_hands_fitted_to_their_joints(umetrack_root: Path) -> None:
-    """The person's hand is the embedded one, so that the planted joints can be met."""
+    """The person has the embedded hand, so the fit can reach the joints."""
     clip, truth = only_clip(umetrack_root, UMETRACK), hot3d.truth("Aria", "umetrack", 2)
     assert clip.hands_from == "keypoints"
     assert clip.fit_error_m is not None
     assert clip.fit_error_m < 5e-4
     for side in SIDES:
-        _, turn, place = truth.hands[side]
+        _, rotation, position_m = truth.hands[side]
         planted = np.stack(
-            [turn[i].apply(hot3d.umetrack_joints(side, hot3d.ANGLES)) + place[i] for i in range(N_FRAMES)]
+            [rotation[i].apply(hot3d.umetrack_joints(side, hot3d.ANGLES)) + position_m[i] for i in range(N_FRAMES)]
         )
         off = np.linalg.norm(track_joints(clip.hands[side], HANDS[side]) - planted, axis=2)
         assert np.nanmax(off) < 2e-3
@@ -325,7 +331,7 @@ def test_a_recording_with_umetracks_hands_alone_gets_hands_fitted_to_their_joint
 
 
 @pytest.mark.slow
-def test_fitted_hands_that_miss_the_joints_are_left_out_with_the_distance(umetrack_root: Path) -> None:
+def test_fitted_hands_that_miss_the_joints_are_rejected_with_the_distance(umetrack_root: Path) -> None:
     (item,) = load(umetrack_root, UMETRACK, most_fit_error_mm=0)
     assert isinstance(item, Quarantined)
     assert item.where == UMETRACK
@@ -334,13 +340,15 @@ def test_fitted_hands_that_miss_the_joints_are_left_out_with_the_distance(umetra
 
 
 @pytest.mark.slow
-def test_mano_wins_where_a_recording_has_both_unless_umetrack_is_asked_for(root: Path, umetrack_root: Path) -> None:
+def test_mano_takes_precedence_if_a_recording_has_both_unless_umetrack_is_requested(
+    root: Path, umetrack_root: Path
+) -> None:
     with pytest.raises(BadInput, match="poses of a hand, got none"):
         load(root, hands="umetrack")
     (root / ARIA / hot3d.UMETRACK_FILE).write_text((umetrack_root / UMETRACK / hot3d.UMETRACK_FILE).read_text())
     assert only_clip(root).hands_from == "parameters"
-    asked = Hot3dAdapter(hands="umetrack")
-    assert (asked.needs_mano, asked.hand_convention.shape) == (False, "fitted")
+    adapter = Hot3dAdapter(hands="umetrack")
+    assert (adapter.needs_mano, adapter.hand_convention.shape) == (False, "fitted")
     assert only_clip(umetrack_root, UMETRACK, hands="umetrack").hands_from == "keypoints"
 
 
@@ -364,8 +372,8 @@ def test_each_kind_of_array_has_the_licence_of_its_files(root: Path, tmp_path: P
     assert all(row.may_be_shared for row in licences_of(open_store(tmp_path / "made").info))
 
 
-def test_licences_of_arrays_that_say_too_little_are_refused(tmp_path: Path) -> None:
+def test_incomplete_licences_of_arrays_are_refused(tmp_path: Path) -> None:
     facts = (BUILT_IN / "hot3d/facts.toml").read_text()
     (tmp_path / "facts.toml").write_text(facts.replace("may_be_shared = true", 'may_be_shared = "yes"'))
     with pytest.raises(BadInput, match=r"licences.object motion: expected a licence and may_be_shared"):
-        facts_beside(str(tmp_path / "adapter.py"))
+        facts_of_adapter(str(tmp_path / "adapter.py"))

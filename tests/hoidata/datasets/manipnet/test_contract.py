@@ -1,4 +1,4 @@
-"""ManipNet keeps the contract of all adapters; what can be wrong with its files."""
+"""ManipNet passes the tests of all adapters; also the problems its files can have."""
 
 import gzip
 from collections.abc import Iterable
@@ -6,11 +6,10 @@ from collections.abc import Iterable
 import pytest
 
 from tests.builders import manipnet
-from tests.builders.manipnet import HAND, THING, motion_text
-from tests.builders.spoilt import (
+from tests.builders.corruption import (
     NO_FACE_OBJ,
     Change,
-    Spoil,
+    Corrupt,
     at,
     cut_in_half,
     emptied,
@@ -21,7 +20,8 @@ from tests.builders.spoilt import (
     one_after_the_other,
     removed,
 )
-from tests.hoidata.datasets.contract import AdapterContract, Row
+from tests.builders.manipnet import HAND, THING, motion_text
+from tests.hoidata.datasets.contract import AdapterContract, FileProblem
 
 FOLDER = "sequences/tetra_large7"
 LEFT, RIGHT, OBJECT = (f"{FOLDER}/{name}.bvh.gz" for name in ("leftHand", "rightHand", "tetra_large"))
@@ -29,7 +29,7 @@ MESH, REFERENCE = "objects/Primitive/tetra_large.obj.gz", "hand/hand_reference.j
 N_FRAMES = 600
 
 
-def zipped(path: str, text: str) -> Spoil:
+def zipped(path: str, text: str) -> Corrupt:
     return holding(path, gzip.compress(text.encode(), mtime=0))
 
 
@@ -49,7 +49,7 @@ def billion_frames(data: bytes) -> bytes:
 @pytest.mark.slow
 class TestManipNet(AdapterContract):
     name = "manipnet"
-    spoilt = "manipnet/tetra_large7"
+    corrupted_sequence = "manipnet/tetra_large7"
     write = staticmethod(manipnet.write_two)
     common_sources = True
     bad_settings = {"margin_frames": (-1, "0 or more")}  # noqa: RUF012
@@ -59,47 +59,49 @@ class TestManipNet(AdapterContract):
         "meshes": "test_meshes_are_right_handed_already",
         "object rotation": "test_object_matrices_act_on_columns",
         "hand translation": "test_the_thumbs_first_joint_is_its_second_one_in_the_file",
-        "finger angles": "test_angles_turn_about_y_then_x_then_z_of_the_turned_frame",
+        "finger angles": "test_angles_rotate_about_y_then_x_then_z_of_the_rotated_frame",
         "left and right": "test_a_right_hand_is_fitted_to_the_right_hands_file",
         "joint order": "test_the_ring_finger_comes_before_the_little_one_in_the_file_and_after_it_here",
         "finger tips": "test_tips_are_the_ends_of_the_capsules_not_the_end_sites",
-        "frames": "test_the_116_hz_file_is_read_by_its_own_clock",
+        "frames": "test_the_116_hz_file_is_read_by_its_clock",
         "gravity": "test_things_fall_along_minus_y",
     }
 
     @staticmethod
-    def rows() -> Iterable[Row]:
+    def file_problems() -> Iterable[FileProblem]:
         bomb = gzip.compress(bytes(300 << 20), 1, mtime=0)
         mesh = MESH.rpartition("/")[2]
-        yield Row("truncated file", LEFT, at(LEFT, cut_in_half), "gzipped text")
-        yield Row("empty file", OBJECT, at(OBJECT, emptied), "line MOTION")
-        yield Row("malicious pickle", LEFT, at(LEFT, malicious), "gzipped text")
-        yield Row("NaN", OBJECT, at(OBJECT, ending(b"0 0 0 0 0 nan")), "finite")
-        yield Row("infinity", OBJECT, at(OBJECT, ending(b"0 0 0 0 0 inf")), "finite")
-        yield Row("wrong columns", OBJECT, at(OBJECT, ending(b"0 0 0")), "6 columns")
-        yield Row("wrong dtype (words)", OBJECT, at(OBJECT, ending(b"0 0 0 0 0 x")), "numbers")
-        yield Row("missing object file", mesh, removed(MESH), "nothing there")
-        yield Row("frame-count mismatch", LEFT, at(LEFT, in_gzip(last_line)), "motion lines as announced")
-        yield Row("non-UTF-8 text", OBJECT, at(OBJECT, in_gzip(lambda data: b"\xff" + data)), "gzipped text")
-        yield Row("symlink out of the root", LEFT, linked_outside(LEFT), "link that leaves")
-        yield Row("zero-face mesh", MESH, at(MESH, in_gzip(lambda _: NO_FACE_OBJ)), "with faces")
-        yield Row("gzip bomb", OBJECT, holding(OBJECT, bomb), "of text")
-        yield Row("absurd size (10^9 frames)", OBJECT, at(OBJECT, in_gzip(billion_frames)), "1 to 1000000 frames")
+        yield FileProblem("truncated file", LEFT, at(LEFT, cut_in_half), "gzipped text")
+        yield FileProblem("empty file", OBJECT, at(OBJECT, emptied), "line MOTION")
+        yield FileProblem("malicious pickle", LEFT, at(LEFT, malicious), "gzipped text")
+        yield FileProblem("NaN", OBJECT, at(OBJECT, ending(b"0 0 0 0 0 nan")), "finite")
+        yield FileProblem("infinity", OBJECT, at(OBJECT, ending(b"0 0 0 0 0 inf")), "finite")
+        yield FileProblem("wrong columns", OBJECT, at(OBJECT, ending(b"0 0 0")), "6 columns")
+        yield FileProblem("wrong dtype (words)", OBJECT, at(OBJECT, ending(b"0 0 0 0 0 x")), "numbers")
+        yield FileProblem("missing object file", mesh, removed(MESH), "nothing there")
+        yield FileProblem("frame-count mismatch", LEFT, at(LEFT, in_gzip(last_line)), "motion lines as announced")
+        yield FileProblem("non-UTF-8 text", OBJECT, at(OBJECT, in_gzip(lambda data: b"\xff" + data)), "gzipped text")
+        yield FileProblem("symlink out of the root", LEFT, linked_outside(LEFT), "link that leaves")
+        yield FileProblem("zero-face mesh", MESH, at(MESH, in_gzip(lambda _: NO_FACE_OBJ)), "with faces")
+        yield FileProblem("gzip bomb", OBJECT, holding(OBJECT, bomb), "of text")
+        yield FileProblem(
+            "absurd size (10^9 frames)", OBJECT, at(OBJECT, in_gzip(billion_frames)), "1 to 1000000 frames"
+        )
 
     @staticmethod
-    def further_rows() -> Iterable[Row]:
+    def format_problems() -> Iterable[FileProblem]:
         neither = one_after_the_other(removed(LEFT), removed(RIGHT))
         other_bones = zipped(RIGHT, motion_text(THING, [[0.0] * 6] * N_FRAMES))
         shorter = zipped(OBJECT, motion_text(THING, [[0.0] * 6] * (N_FRAMES - 1)))
         narrow = zipped(LEFT, motion_text(HAND.replace("~", ""), [[0.0] * 53] * N_FRAMES))
         unknown = "sequences/tetra_large7/teapot9.bvh.gz"
         renamed = lambda root: (root / OBJECT).rename(root / unknown)  # noqa: E731
-        yield Row("no right hand", FOLDER, removed(RIGHT), f"no {RIGHT}")
-        yield Row("no hands", FOLDER, neither, "object motion only")
-        yield Row("no object", FOLDER, removed(OBJECT), "expected motion of one object, got 0")
-        yield Row("another skeleton", RIGHT, other_bones, "17 joints")
-        yield Row("a frame too few", FOLDER, shorter, "599 frames")
-        yield Row("a column too few", LEFT, narrow, "54 columns")
-        yield Row("an object without a mesh", "teapot9", renamed, "objects/*/teapot9.obj.gz")
-        yield Row("half a vertex", "tetra_large.obj", zipped(MESH, "v 1 2\nf 1 2 3"), "tetra_large.obj")
-        yield Row("no capsules", REFERENCE, holding(REFERENCE, '{"capsules": [1]}'), "hand_reference.json")
+        yield FileProblem("no right hand", FOLDER, removed(RIGHT), f"no {RIGHT}")
+        yield FileProblem("no hands", FOLDER, neither, "object motion only")
+        yield FileProblem("no object", FOLDER, removed(OBJECT), "expected motion of one object, got 0")
+        yield FileProblem("another skeleton", RIGHT, other_bones, "17 joints")
+        yield FileProblem("a frame too few", FOLDER, shorter, "599 frames")
+        yield FileProblem("a column too few", LEFT, narrow, "54 columns")
+        yield FileProblem("an object without a mesh", "teapot9", renamed, "objects/*/teapot9.obj.gz")
+        yield FileProblem("half a vertex", "tetra_large.obj", zipped(MESH, "v 1 2\nf 1 2 3"), "tetra_large.obj")
+        yield FileProblem("no capsules", REFERENCE, holding(REFERENCE, '{"capsules": [1]}'), "hand_reference.json")

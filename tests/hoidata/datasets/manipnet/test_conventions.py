@@ -1,6 +1,6 @@
-"""ManipNet's conventions, one test each: BVH and OBJ files typed by hand, joints worked out link by link in the files'
-own left-handed decimetres, and the same with the convention the other way round, which must be off by more than 5 mm.
-Neither our BVH reader nor our mirror is used in the formulas."""
+"""ManipNet's conventions, one test each: handwritten BVH and OBJ files, joints computed link by link in the files'
+left-handed decimetres, and the same with the flipped convention, which must be off by more than 5 mm. The formulas use
+neither hoidata's BVH reader nor its mirror."""
 
 import gzip
 import re
@@ -32,7 +32,7 @@ ENDS = {joint.partition("_")[0].lower(): end for joint, end in TIPS.items()}
 OBJECT_TURN = (62.0, -31.0, 24.0)
 
 
-HZ120, HZ116 = "0.008333334", "0.00862069"  # as the files state their frame time
+HZ120, HZ116 = "0.008333334", "0.00862069"  # with the precision of the files
 
 
 def wrist_dm(frame: int) -> np.ndarray:
@@ -47,7 +47,7 @@ def turned(degrees) -> np.ndarray:
 
 
 def other_order(degrees) -> np.ndarray:
-    """Rz Rx Ry: the same angles the other way round."""
+    """Rz Rx Ry: the same angles in reverse order."""
     return Rotation.from_euler("ZXY", tuple(degrees)[::-1], degrees=True).as_matrix()
 
 
@@ -78,7 +78,7 @@ def world_m(points_dm: np.ndarray) -> np.ndarray:
 
 
 def object_dm(frame: int) -> np.ndarray:
-    """The object's place in its file: its middle lies between index and middle fingertip."""
+    """The object's position in its file: its centre is between index and middle fingertip."""
     chains = left_handed_hand(frame)
     between = (chains["index"][-1] + chains["middle"][-1]) / 2
     return between - turned(OBJECT_TURN) @ (WEDGE.mean(axis=0) * MIRROR)
@@ -123,7 +123,7 @@ def test_the_world_is_seen_in_a_mirror_with_normal_x(right: np.ndarray) -> None:
 
 def test_joint_rotations_are_seen_in_the_mirror_too(right: np.ndarray) -> None:
     def not_turned_over(degrees) -> np.ndarray:
-        """What mirroring positions and offsets alone would do: M R M in the place of R, undone by the last mirror."""
+        """The result of mirroring positions and offsets alone."""
         return np.diag(MIRROR) @ turned(degrees) @ np.diag(MIRROR)
 
     agrees(right[FRAME], world_m(keypoints(120)), world_m(keypoints(120, left_handed_hand(120, not_turned_over))))
@@ -138,7 +138,7 @@ def test_a_unit_is_a_decimetre(right: np.ndarray, clip: Clip) -> None:
     assert off_m(clip.object.model.vertices_m, WEDGE / 100) > WRONG_M
 
 
-def test_angles_turn_about_y_then_x_then_z_of_the_turned_frame(right: np.ndarray) -> None:
+def test_angles_rotate_about_y_then_x_then_z_of_the_rotated_frame(right: np.ndarray) -> None:
     agrees(right[FRAME], world_m(keypoints(120)), world_m(keypoints(120, left_handed_hand(120, other_order))))
 
 
@@ -176,7 +176,7 @@ def test_the_left_hands_tips_are_the_mirrored_capsule_ends(raw: RawTree, right: 
 
 
 def test_meshes_are_right_handed_already(clip: Clip) -> None:
-    """In the left-handed world an OBJ's vertices have their x negated; seen in the mirror they are as written."""
+    """In the left-handed world an OBJ's vertices have their x negated; negated again they are as written."""
     at = clip.source_frames.tolist().index(120)
     placed = (clip.object.world_from_object @ clip.object.model.vertices_m)[at]
     expected = world_m(WEDGE * MIRROR @ turned(OBJECT_TURN).T + object_dm(120))
@@ -199,7 +199,7 @@ def test_the_source_is_read_at_120_hz_every_fourth_frame(right: np.ndarray, raw:
     agrees(right[:, 0], world_m(wrists), world_m(every_frame))
 
 
-def test_the_116_hz_file_is_read_by_its_own_clock(tmp_path: Path) -> None:
+def test_the_116_hz_file_is_read_by_its_clock(tmp_path: Path) -> None:
     recording = read_recording(write(tmp_path, HZ116), KEY.name)
     nearest = [round(number / 30 / float(HZ116)) for number in range(len(recording.source_frames))]
     wrists = np.array([wrist_dm(frame) for frame in nearest])

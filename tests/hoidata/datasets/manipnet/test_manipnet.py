@@ -1,6 +1,6 @@
-"""ManipNet's adapter on a tree written by hand from the format notes: left-handed, decimetres, 120 Hz, 17-joint hands.
+"""ManipNet's adapter on a handwritten raw tree: left-handed, decimetres, 120 Hz, 17-joint hands.
 
-Every expected joint is worked out in the files' own left-handed world, link by link, and only then seen in the mirror.
+Expected joints are computed link by link in the files' left-handed world and then mirrored.
 """
 
 import json
@@ -69,7 +69,7 @@ def test_the_fitted_hands_follow_the_recorded_joints(carried: tuple[RawTree, Cli
         assert clip.hands[side].valid.all()
 
 
-def test_the_way_back_leads_to_the_files_own_numbers(carried: tuple[RawTree, Clip]) -> None:
+def test_source_from_world_recovers_the_numbers_of_the_file(carried: tuple[RawTree, Clip]) -> None:
     _, clip = carried
     world = np.append(clip.object.translation_m[-1], 1.0)
     sway = 0.002 * np.sin(596 / 9)
@@ -79,13 +79,13 @@ def test_the_way_back_leads_to_the_files_own_numbers(carried: tuple[RawTree, Cli
 
 
 @pytest.mark.slow
-def test_frozen_and_jumping_stretches_are_cut_out_and_listed(tmp_path: Path) -> None:
-    left, right, thing = lift_rows(1200)
-    for rows in (left, right, thing):
+def test_frozen_and_jumping_intervals_are_cut_and_listed(tmp_path: Path) -> None:
+    left, right, object_rows = lift_rows(1200)
+    for rows in (left, right, object_rows):
         rows[800:900] = [rows[800]] * 100
     for frame in range(400, 1200):
-        thing[frame] = [thing[frame][0] - 0.15, *thing[frame][1:]]
-    clips, left_out = load(write_tree(tmp_path, left, right, thing))
+        object_rows[frame] = [object_rows[frame][0] - 0.15, *object_rows[frame][1:]]
+    clips, left_out = load(write_tree(tmp_path, left, right, object_rows))
     reasons = {item.source_key: item.got for item in left_out}
     assert reasons["manipnet/tetra_large7/000800-000899"] == "100 exactly equal frames"
     assert reasons["manipnet/tetra_large7/000398-000401"].startswith("object jumps 1.5 cm")
@@ -97,10 +97,10 @@ def test_frozen_and_jumping_stretches_are_cut_out_and_listed(tmp_path: Path) -> 
 
 @pytest.mark.slow
 def test_a_touch_that_is_short_because_tracking_failed_says_so(tmp_path: Path) -> None:
-    left, right, thing = lift_rows(280)
-    for frame in range(140, len(thing)):  # the object jumps 1.5 cm: touches of 34 frames on both sides
-        thing[frame][1] += 0.15
-    _, left_out = load(write_tree(tmp_path, left, right, thing))
+    left, right, object_rows = lift_rows(280)
+    for frame in range(140, len(object_rows)):  # the object jumps 1.5 cm: touches of 34 frames on both sides
+        object_rows[frame][1] += 0.15
+    _, left_out = load(write_tree(tmp_path, left, right, object_rows))
     short = [item.got for item in left_out if item.expected == "45 frames or more"]
     assert len(short) == 2
     assert all(got.endswith(", next to frames that are left out") for got in short)
@@ -108,10 +108,10 @@ def test_a_touch_that_is_short_because_tracking_failed_says_so(tmp_path: Path) -
 
 @pytest.mark.slow
 def test_a_wrist_far_from_the_object_is_cut_out(tmp_path: Path) -> None:
-    left, right, thing = lift_rows()
+    left, right, object_rows = lift_rows()
     for frame in range(500, 600):
         left[frame][0] = -6.0 - (frame - 499) * 0.08
-    _, left_out = load(write_tree(tmp_path, left, right, thing))
+    _, left_out = load(write_tree(tmp_path, left, right, object_rows))
     assert [(item.expected, item.got) for item in left_out] == [
         ("both wrists within 1 m of the object", "a wrist 1.33 m away")
     ]
@@ -144,22 +144,24 @@ def test_file_names_become_words(name: str, words: str) -> None:
 @pytest.mark.slow
 def test_a_margin_keeps_usable_frames_around_the_interaction_under_the_same_id_and_verb(tmp_path: Path) -> None:
     """The hand comes down on the object until frame 100, which is lifted from frame 150; frames 8 to 11 are a jump."""
-    left, right, thing = lift_rows()
+    left, right, object_rows = lift_rows()
     for frame in range(600):
         height = 1.0 + 3.0 * np.clip((frame - 150) / 240, 0, 1)
-        thing[frame][:2] = [thing[frame][0] + (0.5 if frame < 10 else 0.0), height]
+        object_rows[frame][:2] = [object_rows[frame][0] + (0.5 if frame < 10 else 0.0), height]
         right[frame][1] = height + max(0.0, (100 - frame) / 40)
-    raw = write_tree(tmp_path, left, right, thing)
+    raw = write_tree(tmp_path, left, right, object_rows)
     (without,) = (item for item in ManipNetAdapter().load(raw, KEY, HANDS) if isinstance(item, Clip))
-    (some,) = (item for item in ManipNetAdapter(margin_frames=5).load(raw, KEY, HANDS) if isinstance(item, Clip))
-    (all_there_are,) = (
+    (with_margin,) = (item for item in ManipNetAdapter(margin_frames=5).load(raw, KEY, HANDS) if isinstance(item, Clip))
+    (with_all_frames,) = (
         item for item in ManipNetAdapter(margin_frames=99).load(raw, KEY, HANDS) if isinstance(item, Clip)
     )
     first = int(without.source_frames[0])
     assert 40 < first < 120
-    np.testing.assert_array_equal(some.source_frames, np.arange(first - 20, 600, 4))
-    np.testing.assert_array_equal(all_there_are.source_frames, np.arange(12, 600, 4))
-    assert {(clip.clip_id, clip.verb) for clip in (without, some, all_there_are)} == {(without.clip_id, "lift")}
+    np.testing.assert_array_equal(with_margin.source_frames, np.arange(first - 20, 600, 4))
+    np.testing.assert_array_equal(with_all_frames.source_frames, np.arange(12, 600, 4))
+    assert {(clip.clip_id, clip.verb) for clip in (without, with_margin, with_all_frames)} == {
+        (without.clip_id, "lift")
+    }
 
 
 def test_clips_say_that_their_hands_were_fitted_to_keypoints_and_how_well(carried: tuple[RawTree, Clip]) -> None:
@@ -173,14 +175,16 @@ def test_clips_say_that_their_hands_were_fitted_to_keypoints_and_how_well(carrie
     assert clip.fit_error_m == pytest.approx(np.mean(error_m), abs=1e-6)
 
 
-ANGLES = [0.0, 0.0, 0.0, *POSE[6:]]  # a wrist that does not turn holds the object
+ANGLES = [0.0, 0.0, 0.0, *POSE[6:]]  # the grasping wrist does not rotate
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("own")
-    left, right, thing = lift_rows(300)
-    write_tree(folder, *([[*row[:3], *ANGLES] for row in rows] for rows in (left, right)), thing)
+    left, right, object_rows = lift_rows(300)
+    write_tree(
+        folder, *([[*frame_numbers[:3], *ANGLES] for frame_numbers in rows] for rows in (left, right)), object_rows
+    )
     write_skin(folder)
     return folder
 
@@ -216,38 +220,41 @@ def test_joints_tips_capsules_and_sensors_of_the_stored_recording_lie_where_the_
     assert (recording.n_frames, recording.hand.joint_names) == (300, HAND_JOINTS)
     for side in SIDES:
         poses, seven = left_handed(root, side), np.array([7])
-        found = recording.state(side, seven).placed(recording.world_from_wrist(side)[seven])
-        np.testing.assert_allclose(found.joint_m[0], poses[:, :3, 3] * MIRROR / 10, atol=1e-6)
+        result = recording.state(side, seven).placed(recording.world_from_wrist(side)[seven])
+        np.testing.assert_allclose(result.joint_m[0], poses[:, :3, 3] * MIRROR / 10, atol=1e-6)
         arm = np.ones(3) if side == "right" else MIRROR
         ends = [
-            poses[HAND_JOINTS.index(row["joint"])] @ [*(arm * row["end_local"]), 1] for row in reference["capsules"]
+            poses[HAND_JOINTS.index(capsule["joint"])] @ [*(arm * capsule["end_local"]), 1]
+            for capsule in reference["capsules"]
         ]
-        np.testing.assert_allclose(found.capsule_end_m[0], np.array(ends)[:, :3] * MIRROR / 10, atol=1e-6)
-        np.testing.assert_allclose(found.tip_m[0], found.capsule_end_m[0][[6, 9, 12, 15, 18]], atol=1e-9)
+        np.testing.assert_allclose(result.capsule_end_m[0], np.array(ends)[:, :3] * MIRROR / 10, atol=1e-6)
+        np.testing.assert_allclose(result.tip_m[0], result.capsule_end_m[0][[6, 9, 12, 15, 18]], atol=1e-9)
         mirror = np.diag([*arm, 1.0])
         bones = [0, 0, *range(2, 17)]
         skinned = poses[bones] @ mirror @ skin["bind_poses"] @ mirror
         for sensor, vertex in enumerate(reference["proximity_vertices"]):
             bone, weight = skin["bone_indices"][vertex], skin["bone_weights"][vertex]
             rest, normal = arm * skin["vertices"][vertex], arm * skin["normals"][vertex]
-            place = np.einsum("k,kij,j->i", weight, skinned[bone], [*rest, 1])[:3]
-            way = np.einsum("k,kij,j->i", weight, skinned[bone][:, :3, :3], normal)
-            np.testing.assert_allclose(found.sensor_m[0, sensor], place * MIRROR / 10, atol=1e-6)
-            np.testing.assert_allclose(found.sensor_normal[0, sensor], way / np.linalg.norm(way) * MIRROR, atol=1e-5)
+            position_m = np.einsum("k,kij,j->i", weight, skinned[bone], [*rest, 1])[:3]
+            normal_direction = np.einsum("k,kij,j->i", weight, skinned[bone][:, :3, :3], normal)
+            np.testing.assert_allclose(result.sensor_m[0, sensor], position_m * MIRROR / 10, atol=1e-6)
+            np.testing.assert_allclose(
+                result.sensor_normal[0, sensor], normal_direction / np.linalg.norm(normal_direction) * MIRROR, atol=1e-5
+            )
 
 
 def test_the_store_gives_back_the_recording_it_was_given_and_is_sound(root, stored):
-    recording, given = stored.recording(KEY.name), read_hand_recording(RawTree(root), KEY)
+    recording, expected = stored.recording(KEY.name), read_hand_recording(RawTree(root), KEY)
     assert stored.recordings == [KEY.name]
     for side in SIDES:
-        np.testing.assert_array_equal(recording.hands[side].rotvec, given.hands[side].rotvec)
-        np.testing.assert_array_equal(recording.hands[side].wrist_m, given.hands[side].wrist_m)
+        np.testing.assert_array_equal(recording.hands[side].rotvec, expected.hands[side].rotvec)
+        np.testing.assert_array_equal(recording.hands[side].wrist_m, expected.hands[side].wrist_m)
     for name in ("rotvec", "translation_m"):
-        np.testing.assert_array_equal(getattr(recording.object, name), getattr(given.object, name))
-    np.testing.assert_array_equal(recording.usable, given.usable)
-    np.testing.assert_array_equal(recording.state("left").sensor_m, given.state("left").sensor_m)
-    np.testing.assert_array_equal(recording.hand.limit_rad, given.hand.limit_rad)
-    assert {source.path for source in recording.sources} == {source.path for source in given.sources}
+        np.testing.assert_array_equal(getattr(recording.object, name), getattr(expected.object, name))
+    np.testing.assert_array_equal(recording.usable, expected.usable)
+    np.testing.assert_array_equal(recording.state("left").sensor_m, expected.state("left").sensor_m)
+    np.testing.assert_array_equal(recording.hand.limit_rad, expected.hand.limit_rad)
+    assert {source.path for source in recording.sources} == {source.path for source in expected.sources}
     assert check_store(stored.folder) == []
 
 
@@ -271,7 +278,7 @@ def test_without_the_skin_file_there_are_clips_and_no_recordings(root, tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("place", "change"),
+    ("array_path", "change"),
     [
         ("arrays/recordings.npz", lambda arrays: {name: array[:-1] for name, array in arrays.items()}),
         ("arrays/recordings.npz", lambda arrays: dict(list(arrays.items())[1:])),
@@ -279,14 +286,14 @@ def test_without_the_skin_file_there_are_clips_and_no_recordings(root, tmp_path)
         ("arrays/source_hands.npz", lambda arrays: {name: array * np.nan for name, array in arrays.items()}),
     ],
 )
-def test_a_damaged_recording_is_found_and_named(stored, tmp_path, place, change):
+def test_a_damaged_recording_is_found_and_named(stored, tmp_path, array_path, change):
     shutil.copytree(stored.folder, tmp_path / "clips")
-    with np.load(tmp_path / "clips" / place) as archive:
+    with np.load(tmp_path / "clips" / array_path) as archive:
         arrays = dict(archive)
-    np.savez(tmp_path / "clips" / place, **change(arrays))
+    np.savez(tmp_path / "clips" / array_path, **change(arrays))
     problems = check_store(tmp_path / "clips")
     assert problems
-    assert all(problem.where.startswith(place) for problem in problems)
+    assert all(problem.where.startswith(array_path) for problem in problems)
 
 
 @pytest.mark.parametrize(("key", "value"), [("hand", "none"), ("object", "cup"), ("source_files", [99]), ("fps", ...)])

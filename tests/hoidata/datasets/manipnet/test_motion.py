@@ -1,6 +1,6 @@
-"""The BVH reader: a skeleton written by hand, joints by written-out products, and every way a file can be wrong.
+"""The BVH reader on a handwritten skeleton: joints by explicit products, and malformed files.
 
-Also cuts, interactions and verbs from made-up motion whose right answer is plain.
+Also cuts, interactions and verbs of simple artificial motion.
 """
 
 import gzip
@@ -155,9 +155,9 @@ def flags(length: int, *stretches: tuple[int, int]) -> np.ndarray:
     return array
 
 
-def cuts_of(thing: BodyMotion) -> list:
-    n_frames = len(thing.position_m)
-    return find_cuts(body("left hand", swaying(n_frames)), body("right hand", swaying(n_frames)), thing)
+def cuts_of(tracked_object: BodyMotion) -> list:
+    n_frames = len(tracked_object.position_m)
+    return find_cuts(body("left hand", swaying(n_frames)), body("right hand", swaying(n_frames)), tracked_object)
 
 
 def test_a_step_of_the_object_is_a_jump_but_fast_smooth_motion_is_not() -> None:
@@ -170,7 +170,7 @@ def test_a_step_of_the_object_is_a_jump_but_fast_smooth_motion_is_not() -> None:
     assert (cut.start, cut.stop, cut.got) == (248, 252, "object jumps 5.7 cm, 0 degrees")
 
 
-def test_a_sudden_turn_without_displacement_is_a_jump() -> None:
+def test_a_sudden_rotation_without_displacement_is_a_jump() -> None:
     degrees = np.arange(300) * 0.5
     degrees[120:] += 108
     (cut,) = cuts_of(body("object", swaying(300), degrees))
@@ -191,30 +191,30 @@ def test_only_all_three_standing_still_exactly_counts_as_frozen() -> None:
 
 
 def test_cuts_never_overlap() -> None:
-    thing = swaying(400)
-    thing[200:260] = thing[200]
-    thing[230:, 0] += 1.5
-    cuts = cuts_of(body("object", thing))
+    tracked_object = swaying(400)
+    tracked_object[200:260] = tracked_object[200]
+    tracked_object[230:, 0] += 1.5
+    cuts = cuts_of(body("object", tracked_object))
     assert cuts
     assert all(before.stop <= after.start for before, after in pairwise(cuts))
 
 
-def test_each_lift_becomes_a_stretch_and_long_touch_between_lifts_its_own() -> None:
+def test_each_lift_becomes_an_interval_and_long_contact_between_lifts_another() -> None:
     touched, lifted = flags(600, (20, 520)), flags(600, (60, 140), (300, 400))
     pieces = interactions(np.ones(600, dtype=bool), touched, lifted)
     assert pieces == [(20, 155), (155, 285), (285, 415), (415, 520)]
 
 
-def test_stretches_are_short_enough_and_cover_every_usable_touch_once() -> None:
+def test_intervals_are_short_enough_and_cover_each_usable_contact_once() -> None:
     random = np.random.default_rng(5)
     touched = np.repeat(random.random(60) < 0.7, 40)
     lifted = touched & np.repeat(random.random(120) < 0.5, 20)
     usable = np.repeat(random.random(240) < 0.95, 10)
-    seen = np.zeros(2400, dtype=int)
+    coverage = np.zeros(2400, dtype=int)
     for start, stop in interactions(usable, touched, lifted):
         assert 0 < stop - start <= 150
-        seen[start:stop] += 1
-    np.testing.assert_array_equal(seen, (touched & usable).astype(int))
+        coverage[start:stop] += 1
+    np.testing.assert_array_equal(coverage, (touched & usable).astype(int))
 
 
 def test_a_short_gap_in_touch_does_not_divide_an_interaction() -> None:
@@ -236,10 +236,10 @@ def test_a_short_gap_in_touch_does_not_divide_an_interaction() -> None:
     ],
 )
 def test_the_verb_says_what_the_object_does(lift_m: tuple, way_m: float, degrees: float, verb: str | None) -> None:
-    share = np.linspace(0, 1, 60)
+    fraction = np.linspace(0, 1, 60)
     height = np.linspace(*lift_m, 60)
-    centre = np.column_stack((way_m * share, height, np.zeros(60)))
-    rotation = Rotation.from_euler("z", (degrees * share)[:, None], degrees=True).as_matrix()
+    centre = np.column_stack((way_m * fraction, height, np.zeros(60)))
+    rotation = Rotation.from_euler("z", (degrees * fraction)[:, None], degrees=True).as_matrix()
     assert motion_verb(height, centre, rotation) == verb
 
 

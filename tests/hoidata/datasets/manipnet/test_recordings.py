@@ -30,8 +30,8 @@ def test_fitted_hands_keep_joints_tips_and_touch_in_all_five_sequences() -> None
 
 
 def measure_fits(root: Path, hands: HandPair) -> pd.DataFrame:
-    """One row per two-hand sequence below ``root``: errors of joints and tips in all clip frames, and the share of
-    lifted frames with a fitted finger tip within 2 cm of the surface. Sequences that cannot be read are left out."""
+    """One row per two-hand sequence below ``root``: errors of joints and tips in all clip frames, and the fraction of
+    lifted frames with a fitted finger tip within 2 cm of the surface. Unreadable sequences are skipped."""
     adapter, rows, raw = ManipNetAdapter(), [], RawTree(root)
     for key in adapter.sequences(root):
         try:
@@ -40,14 +40,14 @@ def measure_fits(root: Path, hands: HandPair) -> pd.DataFrame:
         except BadInput:
             continue
         measured = [_measure(one, recording, hands) for one in clips]
-        errors_m, near = (np.concatenate(own) for own in zip(*measured, strict=True))
+        errors_m, near = (np.concatenate(columns) for columns in zip(*measured, strict=True))
         tips_mm = 1000 * errors_m[:, FIRST_TIP:].mean()
         rows.append((key.name, len(clips), 1000 * errors_m.mean(), tips_mm, near.mean()))
     return pd.DataFrame(rows, columns=["sequence", "clips", "mean_error_mm", "tip_error_mm", "lifted_near_share"])
 
 
 def _measure(clip: Clip, recording: Recording, hands: HandPair) -> tuple[np.ndarray, np.ndarray]:
-    """Errors (2 x frame, 21) in metres, and for each lifted frame whether a fitted tip is at the object."""
+    """Errors (2 x frame, 21) in metres, and per lifted frame whether a fitted tip touches the object."""
     frames = np.searchsorted(recording.source_frames, clip.source_frames)
     pose = recording.rotation[frames], recording.translation_m[frames]
     errors, tip_distances = [], []

@@ -1,4 +1,4 @@
-"""OakInk2 keeps the contract of all adapters; what can be wrong with its files."""
+"""OakInk2 passes the tests of all adapters; also the problems its files can have."""
 
 import json
 import pickle
@@ -9,12 +9,11 @@ import numpy as np
 import torch
 
 from tests.builders import oakink2
-from tests.builders.oakink2 import BASE, FIRST, LAPTOP, LID, MUG
-from tests.builders.spoilt import (
+from tests.builders.corruption import (
     FAR_CORNER_OBJ,
     NO_FACE_OBJ,
     Command,
-    Spoil,
+    Corrupt,
     at,
     cut_in_half,
     emptied,
@@ -23,7 +22,8 @@ from tests.builders.spoilt import (
     removed,
     set_in,
 )
-from tests.hoidata.datasets.contract import AdapterContract, Row
+from tests.builders.oakink2 import BASE, FIRST, LAPTOP, LID, MUG
+from tests.hoidata.datasets.contract import AdapterContract, FileProblem
 
 TOKEN = LAPTOP.replace("/", "++")
 HAND, PROGRAM = f"anno_preview/{TOKEN}.pkl", f"program/program_info/{TOKEN}.json"
@@ -31,55 +31,55 @@ MESH, NAMES = f"object_repair/align_ds/{LID}/model.obj", "object_repair/obj_desc
 AT = FIRST + 8
 
 
-def edited(change: Callable[[dict], object]) -> Spoil:
+def edited(change: Callable[[dict], object]) -> Corrupt:
     """The annotation, which the builder wrote, with a change."""
 
-    def spoil(root: Path) -> None:
+    def corrupt(root: Path) -> None:
         content = pickle.loads((root / HAND).read_bytes())
         change(content)
         oakink2.dump(root / HAND, content)
 
-    return spoil
+    return corrupt
 
 
-def pose(change: Callable[[np.ndarray], object]) -> Spoil:
+def pose(change: Callable[[np.ndarray], object]) -> Corrupt:
     """The lid's matrix of one frame, changed in its place."""
     return edited(lambda values: change(values["obj_transf"][LID][AT]))
 
 
-def mano(name: str, value: object) -> Spoil:
+def mano(name: str, value: object) -> Corrupt:
     return edited(set_in("raw_mano", AT, name, value=value))  # type: ignore[arg-type]
 
 
-def first(change: Callable[[dict], object]) -> Spoil:
+def first(change: Callable[[dict], object]) -> Corrupt:
     """The first primitive of the program, with a change."""
 
-    def spoil(root: Path) -> None:
+    def corrupt(root: Path) -> None:
         value = json.loads((root / PROGRAM).read_text())
         change(next(iter(value.values())))
         (root / PROGRAM).write_text(json.dumps(value))
 
-    return spoil
+    return corrupt
 
 
 class TestOakink2(AdapterContract):
     name = "oakink2"
-    spoilt = f"oakink2/{LAPTOP}"
+    corrupted_sequence = f"oakink2/{LAPTOP}"
     write = staticmethod(oakink2.write_two)
     slow = True
     bad_settings = dict.fromkeys(("margin_frames", "shortest_frames", "most_off_mm", "most_off_deg"), (-1, "0 or more"))
     conventions = {  # noqa: RUF012
         "unit": "test_places_are_metres",
         "handedness of the world": "contract.py::test_the_world_is_not_seen_in_a_mirror",
-        "meshes": "test_each_part_has_a_mesh_of_its_own_in_its_own_pose",
+        "meshes": "test_each_part_has_a_separate_mesh_and_pose",
         "object rotation": "test_object_matrices_act_on_columns",
         "hand translation": "test_the_translation_is_the_wrist_and_not_added_to_the_rest_wrist",
         "finger angles": "test_fingers_are_absolute_and_quaternions_begin_with_w",
         "shape": "test_the_shape_is_that_of_the_frame",
         "left shape directions": "test_left_shape_directions_stay_as_released",
-        "left and right": "contract.py::test_each_hands_numbers_bend_a_hand_of_that_side",
+        "left and right": "contract.py::test_the_numbers_of_each_hand_bend_a_hand_of_that_side",
         "parts": "test_the_tree_tells_which_parts_are_one_object_and_the_bigger_surface_is_its_base",
-        "hinge": "test_the_hinge_is_found_and_turns_by_the_right_hand",
+        "hinge": "test_the_hinge_is_estimated_and_rotates_by_the_right_hand_rule",
         "frames": "test_every_fourth_frame_from_the_first_is_kept_and_ranges_lack_their_last",
         "validity": "test_a_hand_is_not_valid_without_an_entry_for_the_frame",
         "labels": "test_primitives_are_verbs_and_ranges_tell_the_hand",
@@ -87,40 +87,50 @@ class TestOakink2(AdapterContract):
     }
 
     @staticmethod
-    def rows() -> Iterable[Row]:
+    def file_problems() -> Iterable[FileProblem]:
         long = torch.zeros(1).expand(10**9)
-        yield Row("truncated file", HAND, at(HAND, cut_in_half), "pickle")
-        yield Row("empty file", PROGRAM, at(PROGRAM, emptied), "JSON")
-        yield Row("malicious pickle", HAND, mano("rh__tsl", Command()), "not allowed")
-        yield Row("NaN", HAND, mano("rh__tsl", torch.full((1, 3), torch.nan)), "finite")
-        yield Row("infinity", HAND, pose(lambda matrix: matrix.__setitem__((0, 3), np.inf)), "finite")
-        yield Row("wrong columns", HAND, mano("rh__betas", torch.zeros(1, 11)), "shape (10,)")
-        yield Row("wrong dtype (words)", HAND, mano("rh__betas", "words"), "arrays of shape")
-        yield Row("missing object file", "align_ds", removed(MESH), "one mesh, OBJ or PLY")
-        yield Row("frame-count mismatch", HAND, edited(set_in("raw_mano", value={})), "parameters of a hand")
-        yield Row("symlink out of the root", HAND, linked_outside(HAND), "link that leaves")
-        yield Row("zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces")
-        yield Row("absurd size (face)", MESH, holding(MESH, FAR_CORNER_OBJ), "face corners")
-        yield Row("absurd size (tensor of 10^9)", HAND, mano("rh__betas", long), "larger than")
+        yield FileProblem("truncated file", HAND, at(HAND, cut_in_half), "pickle")
+        yield FileProblem("empty file", PROGRAM, at(PROGRAM, emptied), "JSON")
+        yield FileProblem("malicious pickle", HAND, mano("rh__tsl", Command()), "not allowed")
+        yield FileProblem("NaN", HAND, mano("rh__tsl", torch.full((1, 3), torch.nan)), "finite")
+        yield FileProblem("infinity", HAND, pose(lambda matrix: matrix.__setitem__((0, 3), np.inf)), "finite")
+        yield FileProblem("wrong columns", HAND, mano("rh__betas", torch.zeros(1, 11)), "shape (10,)")
+        yield FileProblem("wrong dtype (words)", HAND, mano("rh__betas", "words"), "arrays of shape")
+        yield FileProblem("missing object file", "align_ds", removed(MESH), "one mesh, OBJ or PLY")
+        yield FileProblem("frame-count mismatch", HAND, edited(set_in("raw_mano", value={})), "parameters of a hand")
+        yield FileProblem("symlink out of the root", HAND, linked_outside(HAND), "link that leaves")
+        yield FileProblem("zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces")
+        yield FileProblem("absurd size (face)", MESH, holding(MESH, FAR_CORNER_OBJ), "face corners")
+        yield FileProblem("absurd size (tensor of 10^9)", HAND, mano("rh__betas", long), "larger than")
 
     @staticmethod
-    def further_rows() -> Iterable[Row]:
+    def format_problems() -> Iterable[FileProblem]:
         frames = "mocap_frame_id_list"
-        yield Row("no program", PROGRAM, removed(PROGRAM), "expected a file")
-        yield Row("no names", NAMES, removed(NAMES), "expected a file")
-        yield Row("a list", HAND, holding(HAND, pickle.dumps([1])), "a dictionary with")
-        yield Row("no poses", HAND, edited(lambda values: values.pop("obj_transf")), "'obj_transf'")
-        yield Row("poses in a list", LID, edited(set_in("obj_transf", LID, value=[1])), "by frame number")
-        yield Row("hands in a list", "raw_mano", edited(set_in("raw_mano", value=[1])), "by frame number")
-        yield Row("words as frames", frames, edited(set_in(frames, value=["1"])), "frame numbers")
-        yield Row("no frames", frames, edited(set_in(frames, value=[])), "frame numbers from 0")
-        yield Row("frames twice", frames, edited(set_in(frames, value=[5, 5, 6])), "rising")
-        yield Row("frames of a year", frames, edited(set_in(frames, value=[0, 9_000_000])), "without great gaps")
-        yield Row("a place beyond all rooms", LID, pose(lambda matrix: matrix.__imul__(1e300)), "at most 1e+06")
-        yield Row("a path as part", "obj_list", edited(set_in("obj_list", value=["../x"])), "part ids such as")
-        yield Row("rows", "frame 14", pose(lambda matrix: matrix.__setitem__(slice(None), matrix.T.copy())), "rotation")
-        yield Row("a mirror", "frame 14", pose(lambda matrix: matrix.__imul__([[-1], [1], [1], [1]])), "a mirror")
-        yield Row("no quaternion", "pose_coeffs", mano("lh__pose_coeffs", torch.zeros(1, 16, 4)), "in frame 14")
-        yield Row("no primitive", PROGRAM, first(lambda entry: entry.pop("primitive")), "'primitive'")
-        yield Row("objects in a text", PROGRAM, first(lambda entry: entry.update(obj_list=MUG)), "part ids such as")
-        yield Row("two meshes", BASE, holding(f"object_repair/align_ds/{BASE}/scan.ply", b""), "model.obj, scan.ply")
+        yield FileProblem("no program", PROGRAM, removed(PROGRAM), "expected a file")
+        yield FileProblem("no names", NAMES, removed(NAMES), "expected a file")
+        yield FileProblem("a list", HAND, holding(HAND, pickle.dumps([1])), "a dictionary with")
+        yield FileProblem("no poses", HAND, edited(lambda values: values.pop("obj_transf")), "'obj_transf'")
+        yield FileProblem("poses in a list", LID, edited(set_in("obj_transf", LID, value=[1])), "by frame number")
+        yield FileProblem("hands in a list", "raw_mano", edited(set_in("raw_mano", value=[1])), "by frame number")
+        yield FileProblem("words as frames", frames, edited(set_in(frames, value=["1"])), "frame numbers")
+        yield FileProblem("no frames", frames, edited(set_in(frames, value=[])), "frame numbers from 0")
+        yield FileProblem("frames twice", frames, edited(set_in(frames, value=[5, 5, 6])), "rising")
+        yield FileProblem(
+            "frames of a year", frames, edited(set_in(frames, value=[0, 9_000_000])), "without great gaps"
+        )
+        yield FileProblem("a place beyond all rooms", LID, pose(lambda matrix: matrix.__imul__(1e300)), "at most 1e+06")
+        yield FileProblem("a path as part", "obj_list", edited(set_in("obj_list", value=["../x"])), "part ids such as")
+        yield FileProblem(
+            "rows", "frame 14", pose(lambda matrix: matrix.__setitem__(slice(None), matrix.T.copy())), "rotation"
+        )
+        yield FileProblem(
+            "a mirror", "frame 14", pose(lambda matrix: matrix.__imul__([[-1], [1], [1], [1]])), "a mirror"
+        )
+        yield FileProblem("no quaternion", "pose_coeffs", mano("lh__pose_coeffs", torch.zeros(1, 16, 4)), "in frame 14")
+        yield FileProblem("no primitive", PROGRAM, first(lambda entry: entry.pop("primitive")), "'primitive'")
+        yield FileProblem(
+            "objects in a text", PROGRAM, first(lambda entry: entry.update(obj_list=MUG)), "part ids such as"
+        )
+        yield FileProblem(
+            "two meshes", BASE, holding(f"object_repair/align_ds/{BASE}/scan.ply", b""), "model.obj, scan.ply"
+        )

@@ -1,5 +1,5 @@
-"""OakInk2's conventions, one test each: numbers typed here, formulas written out, and the same with the convention the
-other way round, which must be off by more than 5 mm. No engine of ours is used."""
+"""OakInk2's conventions, one test each: literal numbers, explicit formulas, and the same with the flipped convention,
+which must be off by more than 5 mm. The formulas use no code of hoidata."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +32,7 @@ SHAPE = {
     "right": [-1.0, 0.8, -0.7, 1.1, 0.3, -0.6, 0.5, -0.4, 0.9, -0.2],
 }
 BOX, DOOR, SPOON = "O02@0300@00001", "O02@0300@00002", "C12001"
-CORNERS = {  # metres: the box of a microwave, its door beside it and a spoon
+CORNERS = {  # metres: the box of a microwave, its door next to it and a spoon
     BOX: [[0.0, 0.0, 0.0], [0.4, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.25]],
     DOOR: [[0.0, 0.01, 0.0], [0.39, 0.01, 0.0], [0.0, 0.03, 0.0], [0.0, 0.01, 0.24]],
     SPOON: [[0.0, 0.0, 0.0], [0.18, 0.005, 0.0], [0.17, 0.02, 0.01], [0.01, -0.01, 0.025]],
@@ -46,10 +46,10 @@ def frames() -> list[int]:
     return list(range(FIRST, FIRST + N_SOURCE))
 
 
-def matrix(turn, shift_m) -> np.ndarray:
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), shift_m
-    return found
+def matrix(rotation, shift_m) -> np.ndarray:
+    actual = np.eye(4)
+    actual[:3, :3], actual[:3, 3] = Rotation.from_rotvec(rotation).as_matrix(), shift_m
+    return actual
 
 
 def place(at: int) -> np.ndarray:
@@ -58,8 +58,8 @@ def place(at: int) -> np.ndarray:
 
 
 def door(at: int) -> np.ndarray:
-    turn = Rotation.from_rotvec(ANGLE[at] * HINGE_AXIS)
-    return place(at) @ matrix(turn.as_rotvec(), HINGE_M - turn.apply(HINGE_M))
+    rotation = Rotation.from_rotvec(ANGLE[at] * HINGE_AXIS)
+    return place(at) @ matrix(rotation.as_rotvec(), HINGE_M - rotation.apply(HINGE_M))
 
 
 def wrist(side: str, at: int) -> np.ndarray:
@@ -107,8 +107,8 @@ def write(root: Path, values: dict | None = None) -> Path:
 
 
 def load(root: Path) -> list[Clip]:
-    found = Oakink2Adapter(shortest_frames=2).load(RawTree(root), KEY, load_embedded_hands())
-    return [item for item in found if isinstance(item, Clip)]
+    actual = Oakink2Adapter(shortest_frames=2).load(RawTree(root), KEY, load_embedded_hands())
+    return [item for item in actual if isinstance(item, Clip)]
 
 
 @pytest.fixture(scope="module")
@@ -126,8 +126,8 @@ def seen_corners(name: str, pose: np.ndarray, scale: float = 1.0) -> np.ndarray:
 
 
 def stirred(clips) -> Clip:
-    (found,) = (clip for clip in clips if clip.verb == "stir")
-    return found
+    (actual,) = (clip for clip in clips if clip.verb == "stir")
+    return actual
 
 
 def test_places_are_metres(clips):
@@ -140,13 +140,13 @@ def test_object_matrices_act_on_columns(clips):
     agrees(corners(stirred(clips)), seen_corners(SPOON, place(AT_SOURCE)), seen_corners(SPOON, by_rows))
 
 
-def test_each_part_has_a_mesh_of_its_own_in_its_own_pose(clips):
+def test_each_part_has_a_separate_mesh_and_pose(clips):
     """The door's pose is that of its mesh in the world, not in the box."""
     (oven,) = stirred(clips).other_objects
-    found = oven.points_in_world(oven.model.vertices_m, oven.model.part)[AT]
+    actual = oven.points_in_world(oven.model.vertices_m, oven.model.part)[AT]
     expected = [seen_corners(BOX, place(AT_SOURCE)), seen_corners(DOOR, door(AT_SOURCE))]
     in_the_box = seen_corners(DOOR, place(AT_SOURCE) @ door(AT_SOURCE))
-    agrees(found, np.concatenate(expected), np.concatenate([expected[0], in_the_box]))
+    agrees(actual, np.concatenate(expected), np.concatenate([expected[0], in_the_box]))
 
 
 def test_the_tree_tells_which_parts_are_one_object_and_the_bigger_surface_is_its_base(clips, tmp_path):
@@ -159,7 +159,7 @@ def test_the_tree_tells_which_parts_are_one_object_and_the_bigger_surface_is_its
     assert (alone.model.name, alone.is_articulated) == (BOX, False)
 
 
-def test_the_hinge_is_found_and_turns_by_the_right_hand(clips):
+def test_the_hinge_is_estimated_and_rotates_by_the_right_hand_rule(clips):
     oven = stirred(clips).other_objects[0]
     assert np.abs(oven.model.hinge.axis - HINGE_AXIS).max() < 1e-6
     assert np.abs(oven.model.hinge.origin_m - HINGE_M).max() < 1e-6
@@ -171,7 +171,7 @@ def test_every_fourth_frame_from_the_first_is_kept_and_ranges_lack_their_last(cl
     assert stirred(clips).source_frames.tolist() == list(range(FIRST, FIRST + N_SOURCE, 4))
     (opened,) = (clip for clip in clips if clip.verb == "open")
     assert opened.source_frames.tolist() == [16, 20, 24, 28, 32, 36, 40]
-    (last,) = (own for own in read_program(b'{"(None, (16, 40))": %s}' % ENTRY, "x"))
+    (last,) = (hand_values for hand_values in read_program(b'{"(None, (16, 40))": %s}' % ENTRY, "x"))
     assert last.span == (16, 40)
     assert [str(key) for key in Oakink2Adapter().sequences(Path("nowhere"))] == []
     speed = np.linalg.norm(np.diff(stirred(clips).hands["left"].wrist_m[:2], axis=0)) * 30
@@ -215,7 +215,7 @@ def test_gravity_is_unknown_with_its_reason(clips):
 
 
 def hand_joints(side: str, hands, bends=BENT, betas=None, added_to_rest: bool = False, orient=None) -> np.ndarray:
-    """(16, 3) joints as OakInk2 means its numbers: the wrist is put at the origin, the hand turned, then moved."""
+    """(16, 3) joints by OakInk2's convention: wrist at the origin, hand rotated, then translated."""
     rest = rest_points(hands[side], shape(side, AT_SOURCE) if betas is None else betas)
     joints = chain(rest, ORIENT[side] if orient is None else orient, np.array(bends), np.zeros(3))
     return joints - (0 if added_to_rest else rest[0]) + wrist(side, AT_SOURCE)
@@ -224,21 +224,21 @@ def hand_joints(side: str, hands, bends=BENT, betas=None, added_to_rest: bool = 
 @pytest.mark.parametrize("side", SIDES)
 class TestHands:
     def test_the_translation_is_the_wrist_and_not_added_to_the_rest_wrist(self, clips, hands, side):
-        found = joints_as_stored(stirred(clips).hands[side], hands[side], AT)
-        agrees(found, hand_joints(side, hands), hand_joints(side, hands, added_to_rest=True))
+        actual = joints_as_stored(stirred(clips).hands[side], hands[side], AT)
+        agrees(actual, hand_joints(side, hands), hand_joints(side, hands, added_to_rest=True))
 
     def test_fingers_are_absolute_and_quaternions_begin_with_w(self, clips, hands, side):
-        found = joints_as_stored(stirred(clips).hands[side], hands[side], AT)
+        actual = joints_as_stored(stirred(clips).hands[side], hands[side], AT)
         relative = hand_joints(side, hands, bends=BENT + hands[side].mean_pose)
         stored = quaternions(ORIENT[side], BENT)  # as if their last number were w
         turns = Rotation.from_quat(stored).as_rotvec().ravel()
-        agrees(found, hand_joints(side, hands), relative, hand_joints(side, hands, turns[3:], orient=turns[:3]))
+        agrees(actual, hand_joints(side, hands), relative, hand_joints(side, hands, turns[3:], orient=turns[:3]))
 
     def test_the_shape_is_that_of_the_frame(self, clips, hands, side):
-        found = joints_as_stored(stirred(clips).hands[side], hands[side], AT)
+        actual = joints_as_stored(stirred(clips).hands[side], hands[side], AT)
         assert stirred(clips).hands[side].betas.shape == (13, 10)
         other = hand_joints(side, hands, betas=6 * shape(side, 0))
-        agrees(found, hand_joints(side, hands), other)
+        agrees(actual, hand_joints(side, hands), other)
         first = joints_as_stored(stirred(clips).hands[side], hands[side], 0)
         moved = hand_joints(side, hands, betas=shape(side, 0)) - (wrist(side, AT_SOURCE) - wrist(side, 0))
         assert off_m(first, moved) < EXACT_M
@@ -252,14 +252,14 @@ def test_left_shape_directions_stay_as_released(hands):
 class TestSeatedPerson(SeatedPersonContract):
     @pytest.fixture
     def look(self, tmp_path, hands):
-        """Joints of both hands and the spoon's three edges in the world, of a person whose numbers are given."""
+        """Joints of both hands and the spoon's three edges in the world, of a person of known pose."""
 
         def of(person):
             values = annotation()
             for side, (orient, angles, wrist_m) in person.hands.items():
-                own = {"pose_coeffs": quaternions(orient, angles), "tsl": wrist_m}
+                hand_values = {"pose_coeffs": quaternions(orient, angles), "tsl": wrist_m}
                 for frame in frames():
-                    values["raw_mano"][frame] |= {f"{PREFIX[side]}{name}": tensor(v) for name, v in own.items()}
+                    values["raw_mano"][frame] |= {f"{PREFIX[side]}{name}": tensor(v) for name, v in hand_values.items()}
             values["obj_transf"][SPOON] = dict.fromkeys(frames(), matrix(person.object_orient, (0.2, 0.1, 0.8)))
             write(tmp_path, values)
             spoon = np.array([[0.2, 0, 0], [-0.2, 0, 0], [0.2, 0.08, 0], [0.2, 0, 0.05]]) * person.signs

@@ -1,4 +1,4 @@
-"""OakInk2's adapter on recordings written from a known truth, and what becomes of objects of several parts."""
+"""OakInk2's adapter on recordings written from a ground truth, with objects of several parts."""
 
 import json
 import time
@@ -60,30 +60,30 @@ def root(tmp_path_factory):
 
 
 def off_truth_m(clip: Clip, made: Recording, ids: tuple[tuple[str, ...], ...]) -> float:
-    """How far the farthest vertex of any object of a clip is from where its part's pose in the truth puts it."""
+    """Largest distance of any object vertex of a clip from its ground truth position."""
     rows, off = clip.source_frames - FIRST, []
     for track, names in zip((clip.object, *clip.other_objects), ids, strict=True):
-        found = track.points_in_world(track.model.vertices_m, track.model.part)
+        result = track.points_in_world(track.model.vertices_m, track.model.part)
         for part, name in enumerate(names):
             mesh, poses = made.parts[name]
             truth = mesh.vertices @ poses[rows, :3, :3].transpose(0, 2, 1) + poses[rows, None, :3, 3]
-            off.append(np.abs(found[:, track.model.part == part] - truth).max())
+            off.append(np.abs(result[:, track.model.part == part] - truth).max())
     return max(off)
 
 
 def test_recordings_come_back_to_their_truth_in_the_world(root):
-    wanted = {
+    expected_ids = {
         (LAPTOP, "open"): ((BASE, LID),),
         (LAPTOP, "rearrange"): ((MUG,), (BASE, LID)),
         (BOTTLE, "unscrew"): ((CAP,), (BODY,)),
         (CUP, "pour"): ((MUG,),),
     }
-    for (name, verb), ids in wanted.items():
-        made, clip = recording(name, [LAPTOP, BOTTLE, CUP].index(name)), the_clip(load(root, name), verb)
-        assert off_truth_m(clip, made, ids) < 1e-4
+    for (name, verb), ids in expected_ids.items():
+        truth, clip = recording(name, [LAPTOP, BOTTLE, CUP].index(name)), the_clip(load(root, name), verb)
+        assert off_truth_m(clip, truth, ids) < 1e-4
         rows = clip.source_frames - FIRST
         for side in SIDES:
-            orient, fingers, wrist, betas = made.hands[side]
+            orient, fingers, wrist, betas = truth.hands[side]
             track = clip.hands[side]
             assert track.valid.all()
             assert np.abs(track.wrist_m - wrist[rows]).max() < 1e-4
@@ -93,7 +93,7 @@ def test_recordings_come_back_to_their_truth_in_the_world(root):
             assert np.abs(track.betas - betas).max() < 1e-6
 
 
-def test_two_parts_that_turn_about_one_axis_are_one_object_with_its_hinge(root):
+def test_two_parts_that_rotate_about_one_axis_are_one_object_with_a_hinge(root):
     track = the_clip(load(root, LAPTOP), "open").object
     assert np.abs(track.model.hinge.axis - AXIS).max() < 1e-6
     off_axis = np.cross(track.model.hinge.origin_m - ORIGIN, AXIS)
@@ -108,8 +108,8 @@ def test_a_clip_has_the_words_hand_and_objects_of_its_primitive_and_others_are_l
     assert (clip.object_words, clip.labelled_hand, clip.subject) == ("bottle cap", "both", "A004")
     assert clip.clip_id == f"oakink2/{BOTTLE}/left-6-87-right-10-87"
     assert [track.model.name for track in (clip.object, *clip.other_objects)] == [CAP, BODY]
-    found = {item.source_key.rpartition("/")[2]: (item.expected, item.got) for item in reasons(results)}
-    assert found == {
+    result = {item.source_key.rpartition("/")[2]: (item.expected, item.got) for item in reasons(results)}
+    assert result == {
         "left-46-66": ("20 frames (at 30 per second) with the objects", "5 in mocap frames 46 to 65"),
         "right-6-87": ("a primitive with a name", "'?(unk)'"),
         "right-8-87": ("poses of an object of the primitive", "none of O02@0099@00001"),
@@ -128,27 +128,27 @@ def test_an_object_without_a_name_makes_no_clip(root, tmp_path):
 
 
 def test_parts_whose_meshes_share_no_frame_rest_as_they_first_lie(tmp_path):
-    """The lid's mesh in a frame of its own: no hinge takes it to rest beside the base."""
-    made = recording(LAPTOP, 3)
-    own = transforms(Rotation.from_rotvec([[1.0, 0.4, -0.7]]), [[0.3, 0.1, 0.2]])[0]
-    mesh, poses = made.parts[LID]
-    moved = mesh.copy().apply_transform(np.linalg.inv(own))
-    made = replace(made, parts={**made.parts, LID: (moved, poses @ own)})
-    clip = the_clip(load(write_recording(tmp_path, made), LAPTOP), "open")
-    assert off_truth_m(clip, made, ((BASE, LID),)) < 1e-4
+    """The lid's mesh has another frame, so no hinge fits the pose of the meshes."""
+    truth = recording(LAPTOP, 3)
+    lid_from_mesh = transforms(Rotation.from_rotvec([[1.0, 0.4, -0.7]]), [[0.3, 0.1, 0.2]])[0]
+    mesh, poses = truth.parts[LID]
+    moved = mesh.copy().apply_transform(np.linalg.inv(lid_from_mesh))
+    truth = replace(truth, parts={**truth.parts, LID: (moved, poses @ lid_from_mesh)})
+    clip = the_clip(load(write_recording(tmp_path, truth), LAPTOP), "open")
+    assert off_truth_m(clip, truth, ((BASE, LID),)) < 1e-4
     assert clip.object.hinge_rad[0] == pytest.approx(0, abs=1e-6)
     assert clip.object.hinge_rad[-1] == pytest.approx(1.5, abs=1e-4)
 
 
 @pytest.mark.slow
 def test_frames_off_the_hinge_or_untracked_divide_a_clip_and_parts_mostly_off_it_stay_two_objects(tmp_path):
-    made = recording(LAPTOP, 4, 401)
-    lid, poses = made.parts[LID]
+    truth = recording(LAPTOP, 4, 401)
+    lid, poses = truth.parts[LID]
     poses = poses.copy()
     poses[76:92, :3, 3] += 0.1
     program = (((FIRST, FIRST + 401), None, "open_laptop_lid", "lh_main", [LID], None),)
-    made = replace(made, parts={**made.parts, LID: (lid, poses)}, program=program, untracked={BASE: (FIRST + 120,)})
-    results = load(write_recording(tmp_path / "few", made), LAPTOP, shortest_frames=5)
+    truth = replace(truth, parts={**truth.parts, LID: (lid, poses)}, program=program, untracked={BASE: (FIRST + 120,)})
+    results = load(write_recording(tmp_path / "few", truth), LAPTOP, shortest_frames=5)
     clips = [item for item in results if isinstance(item, Clip)]
     spans = [(int(clip.source_frames[0]), int(clip.source_frames[-1])) for clip in clips]
     assert spans == [(6, 78), (98, 406)]
@@ -157,22 +157,22 @@ def test_frames_off_the_hinge_or_untracked_divide_a_clip_and_parts_mostly_off_it
     assert missing.got == "none in source frames 82 to 94"
     assert reason.source_key == f"oakink2/{LAPTOP}/hinge of O02@0061"
     assert "4 frames, the first 82" in reason.got
-    # The one frame without a base is bridged.
+    # The single frame without a base is interpolated.
     assert clips[1].source_frames[[6, 7, 8, 9]].tolist() == [122, 122, 130, 134]
     assert np.flatnonzero(~clips[1].recorded).tolist() == [7]
     hinge = clips[1].object.hinge_rad
     assert hinge[7] == pytest.approx((hinge[6] + hinge[8]) / 2, abs=0.01)
     assert all("O02@0061: hinge: " in clip.gravity_note for clip in clips)
     poses[:100, 2, 3] += 0.1
-    (alone, *_) = load(write_recording(tmp_path / "most", made), LAPTOP, shortest_frames=5)
+    (alone, *_) = load(write_recording(tmp_path / "most", truth), LAPTOP, shortest_frames=5)
     assert isinstance(alone, Clip)
     assert (alone.object.model.name, alone.object.is_articulated, alone.object_words) == (LID, False, "laptop lid")
 
 
-def test_a_hinge_is_found_among_noise_and_outliers_and_none_in_a_screw_or_a_small_turn():
+def test_a_hinge_is_found_despite_noise_and_outliers_and_none_in_a_screw_or_a_small_rotation():
     random, angle = np.random.default_rng(0), np.linspace(0, 1, 200)
-    turn = Rotation.from_rotvec(np.outer(angle, AXIS))
-    exact = transforms(turn, ORIGIN - turn.apply(ORIGIN))
+    rotation = Rotation.from_rotvec(np.outer(angle, AXIS))
+    exact = transforms(rotation, ORIGIN - rotation.apply(ORIGIN))
     base = transforms(Rotation.random(200, rng=1), random.normal(0, 1, (200, 3)))
     corners = (0.2 * random.normal(0, 1, (8, 3)), 0.2 * random.normal(0, 1, (8, 3)))
     noisy = exact @ transforms(
@@ -182,12 +182,12 @@ def test_a_hinge_is_found_among_noise_and_outliers_and_none_in_a_screw_or_a_smal
     hinge, fit = hinge_between(base, noisy, corners, 20, 10)
     assert np.rad2deg(np.arccos(hinge.axis @ AXIS)) < 0.5
     assert np.linalg.norm(np.cross(hinge.origin_m - ORIGIN, AXIS)) < 2e-3
-    assert np.flatnonzero(fit.off(20, 10)).tolist() == [5, 60]
+    assert np.flatnonzero(fit.exceeds(20, 10)).tolist() == [5, 60]
     screw = exact.copy()
     screw[:, :3, 3] += np.outer(angle, 0.2 * AXIS)
     assert hinge_between(base, screw, corners, 20, 10) is None
     assert find_hinge(exact[:30]) is None
-    opposite = transforms(turn.inv(), ORIGIN - turn.inv().apply(ORIGIN))
+    opposite = transforms(rotation.inv(), ORIGIN - rotation.inv().apply(ORIGIN))
     assert find_hinge(opposite).axis == pytest.approx(AXIS)
 
 
@@ -239,7 +239,7 @@ def test_its_words_make_sentences():
 
 
 def test_a_tree_of_parts_as_deep_as_its_file_allows_is_read_in_less_than_two_seconds():
-    """Each part was followed up to the top on its own, which took quadratic time: minutes for a megabyte."""
+    """Searching the root of each part separately takes quadratic time: minutes for a megabyte."""
     names = [f"{number:06d}" for number in range(60_000)]
     tree = {parent: [child] for child, parent in pairwise(names)}
     start = time.process_time()

@@ -1,4 +1,4 @@
-"""TACO's adapter on files written here as the format notes have them: pickles of torch tensors, OBJ in centimetres."""
+"""TACO's adapter on files written here: pickles of torch tensors, OBJ in centimetres."""
 
 import io
 import pickle
@@ -14,7 +14,7 @@ from hoidata.clips.clip import SIDES, Clip
 from hoidata.clips.validation import check_clip
 from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets import Quarantined, RawTree
-from hoidata.datasets.taco.adapter import TacoAdapter, frames_of, triplet
+from hoidata.datasets.taco.adapter import TacoAdapter, frames_by_side, triplet
 from hoidata.errors import BadInput, ChangedMeanwhile
 from hoidata.store.store import open_store
 from tests.builders.taco import HANDS, KEY, N_FRAMES, NAMES, dump, write_taco
@@ -59,14 +59,14 @@ def test_its_words_make_sentences() -> None:
     assert four_sentences(verb, noun, "right")[0] == "Put in a spoon with the right hand."
 
 
-def test_a_clip_names_the_eight_files_it_was_made_from(root: Path) -> None:
+def test_a_clip_names_its_eight_source_files(root: Path) -> None:
     hands = [f"Hand_Poses/{NAMES[0]}/{side}_hand{kind}.pkl" for side in SIDES for kind in ("", "_shape")]
     objects = [f"Object_Poses/{NAMES[0]}/{name}.npy" for name in ("target_105", "tool_012")]
     models = [f"Object_Models/{name}_cm.obj" for name in ("012", "105")]
     assert [source.path for source in load(root).sources] == sorted(hands + objects + models)
 
 
-def test_a_missing_shape_file_means_zero_betas_as_in_the_makers_loader_and_is_told(root: Path) -> None:
+def test_a_missing_shape_file_gives_zero_betas_as_in_the_authors_loader_and_is_reported(root: Path) -> None:
     path = hand_file(root, "left").with_name("left_hand_shape.pkl")
     whole = load(root)
     path.unlink()
@@ -117,7 +117,7 @@ def keys(*numbers: int, width: int = 0) -> list:
     ],
 )
 def test_frame_keys_are_placed_by_their_numbers(left: list, right: list, frames: list[int]) -> None:
-    placed = frames_of("triplet/recording", {"left": left, "right": right}, 3)["right"]
+    placed = frames_by_side("triplet/recording", {"left": left, "right": right}, 3)["right"]
     assert [placed[key] for key in right] == frames
 
 
@@ -138,7 +138,7 @@ def test_frame_keys_are_placed_by_their_numbers(left: list, right: list, frames:
 )
 def test_frame_keys_that_tell_no_frame_are_refused(left: list, right: list, message: str) -> None:
     with pytest.raises(BadInput, match=message):
-        frames_of("triplet/recording", {"left": left, "right": right}, 3)
+        frames_by_side("triplet/recording", {"left": left, "right": right}, 3)
 
 
 def test_the_clip_reaches_from_the_first_to_the_last_touch_and_a_margin_widens_it(root: Path) -> None:

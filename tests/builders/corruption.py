@@ -1,4 +1,4 @@
-"""Ways to spoil a file of a raw tree: ``at(path, change)`` and others take the root and spoil one file below it."""
+"""Ways to corrupt a file of a raw tree: ``at(path, change)`` and others return a function of the root."""
 
 import gzip
 import io
@@ -11,45 +11,45 @@ from pathlib import Path
 
 import numpy as np
 
-Spoil = Callable[[Path], object]
+Corrupt = Callable[[Path], object]
 Change = Callable[[bytes], bytes]
 CANARY = Path("canary")
 
 
-def at(path: str, change: Change) -> Spoil:
-    """Replace what a file holds; one that is not there is made."""
+def at(path: str, change: Change) -> Corrupt:
+    """Change the content of a file, which is created if it is missing."""
 
-    def spoil(root: Path) -> None:
-        place = root / path
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_bytes(change(place.read_bytes() if place.exists() else b""))
+    def corrupt(root: Path) -> None:
+        file = root / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(change(file.read_bytes() if file.exists() else b""))
 
-    return spoil
+    return corrupt
 
 
-def holding(path: str, content: bytes | str) -> Spoil:
+def holding(path: str, content: bytes | str) -> Corrupt:
     return at(path, lambda _: content.encode() if isinstance(content, str) else content)
 
 
-def removed(path: str) -> Spoil:
+def removed(path: str) -> Corrupt:
     return lambda root: (root / path).unlink()
 
 
-def linked_outside(path: str) -> Spoil:
-    def spoil(root: Path) -> None:
+def linked_outside(path: str) -> Corrupt:
+    def corrupt(root: Path) -> None:
         outside = root.parent / "outside"
         (root / path).rename(outside)
         (root / path).symlink_to(outside)
 
-    return spoil
+    return corrupt
 
 
-def without_folder(path: str) -> Spoil:
+def without_folder(path: str) -> Corrupt:
     return lambda root: shutil.rmtree(root / path)
 
 
-def one_after_the_other(*spoils: Spoil) -> Spoil:
-    return lambda root: [spoil(root) for spoil in spoils]
+def one_after_the_other(*corruptions: Corrupt) -> Corrupt:
+    return lambda root: [corrupt(root) for corrupt in corruptions]
 
 
 def cut_in_half(data: bytes) -> bytes:
@@ -61,7 +61,7 @@ def emptied(_: bytes) -> bytes:
 
 
 class Command:
-    """Pickles as a call that would leave a file behind."""
+    """Pickles as a call that would create a file."""
 
     def __reduce__(self) -> tuple:
         return os.system, (f"touch {CANARY.resolve()}",)
@@ -83,7 +83,7 @@ def huge_npy(_: bytes) -> bytes:
 
 
 def in_array(change: Callable[[np.ndarray], np.ndarray]) -> Change:
-    """Of the array in an .npy file."""
+    """Change the array of an .npy file."""
     return lambda data: npy_of(change(np.load(io.BytesIO(data))))
 
 
@@ -100,7 +100,7 @@ def replaced(old: bytes, new: bytes) -> Change:
 
 
 def with_member(name: str, content: bytes, again: bool = False) -> Change:
-    """An .npz with one member replaced, or there twice."""
+    """An .npz file with one member replaced or duplicated."""
 
     def change(data: bytes) -> bytes:
         stream = io.BytesIO()
