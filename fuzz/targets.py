@@ -166,7 +166,7 @@ def _restricted(data: bytes) -> Any:
 
 
 def _mano_values(data: bytes) -> Any:
-    content = restricted_pickle.restricted_load(data, mano._ALLOW, encoding="latin1", where="MANO_RIGHT.pkl")
+    content = restricted_pickle.restricted_load(data, mano._ALLOW, encoding="latin1", path="MANO_RIGHT.pkl")
     return [mano._dense("MANO_RIGHT.pkl", value) for value in (content if isinstance(content, dict) else {}).values()]
 
 

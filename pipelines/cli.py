@@ -59,9 +59,9 @@ app.command("export")(export.export)
 
 @app.callback()
 def _check_what_is_read() -> None:
-    from hoidata.files.written import ask_digests_of
+    from hoidata.files.written import verify_with
 
-    ask_digests_of(_written_digest)
+    verify_with(_written_digest)
 
 
 def main() -> None:

@@ -46,8 +46,8 @@ def read_metrics(path: Path) -> Facts:
     found = read_json(path)
     if "figures" not in found:
         return found.check({"empty": str})
-    found.check_given({"motions": int, "held_out_clips": int, "left_out": list})
-    found.check_given(dict.fromkeys(("figures", "intervals", "notes", "evaluators", "diagnostics", "unmeasured"), dict))
+    found.check_present({"motions": int, "held_out_clips": int, "left_out": list})
+    found.check_present(dict.fromkeys(("figures", "intervals", "notes", "evaluators", "diagnostics", "unmeasured"), dict))
     found["figures"].check(dict.fromkeys(found["figures"], NUMBER_OR_NONE))
     for name in ("intervals", "evaluators"):
         found.get(name, Facts(path, {})).check(dict.fromkeys(found.get(name, ()), dict))
@@ -57,7 +57,7 @@ def read_metrics(path: Path) -> Facts:
             if ends and not (len(ends) == 2 and all(isinstance(end, NUMBER) for end in ends)):
                 raise BadInput(path, f"two numbers as the entry {intervals.key + name!r}", repr(ends)[:80], REMEDY)
     for evaluator in found.get("evaluators", {}).values():
-        evaluator.check_given({"labels": list, "confusion": list, "digest": str})
+        evaluator.check_present({"labels": list, "confusion": list, "digest": str})
     return found
 
 

@@ -42,7 +42,7 @@ def _splits(data: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     found = read_json(path, {"chosen": {"clips": {}}})
-    found.check_given({"missing": dict})
+    found.check_present({"missing": dict})
     return found
 
 

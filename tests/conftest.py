@@ -35,7 +35,7 @@ def _usual_process() -> Iterator[None]:
     no fixture that tests share, is to notice which ran before it."""
     yield
     if written := sys.modules.get("hoidata.files.written"):
-        written._known_by.clear()
+        written._digest_sources.clear()
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(1)
         torch.set_deterministic_debug_mode("default")

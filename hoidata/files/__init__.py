@@ -1,4 +1,4 @@
-"""Files written whole or not at all, read without executing anything, and known by their content."""
+"""Atomic writes, content digests, and readers that never execute code of a file."""
 
 from hoidata.files.atomic import (
     atomic_file,

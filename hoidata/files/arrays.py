@@ -1,4 +1,4 @@
-"""NPZ files: stored (not compressed, so one array can be read alone), equal arrays give equal bytes, no pickles."""
+"""Reads and writes uncompressed NPZ files without pickles; equal arrays give equal bytes."""
 
 import zipfile
 from collections.abc import Mapping
@@ -13,9 +13,9 @@ from hoidata.files.numpy_files import load_npz_arrays
 
 
 def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write named arrays in the mapping's order, atomically. Object arrays are refused (ValueError).
+    """Write named arrays atomically, in the mapping's order. Raises ValueError for object arrays.
 
-    The bytes depend on names and arrays alone; they are those of ``np.savez`` on Python 3.11.4 and later.
+    The bytes depend on names and arrays only, and equal those of ``np.savez`` on Python 3.11.4 and later.
     """
     for name, array in arrays.items():
         if np.asarray(array).dtype.hasobject:
@@ -25,7 +25,7 @@ def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def write_npz_to(stream: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
-    """The same into a stream that can seek. Raises ValueError on arrays of objects."""
+    """Write named arrays to a seekable stream. Raises ValueError for object arrays."""
     with zipfile.ZipFile(stream, "w") as archive:
         for name, array in arrays.items():
             with archive.open(_Member(f"{name}.npy"), "w", force_zip64=True) as member:
@@ -33,17 +33,17 @@ def write_npz_to(stream: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
 
 
 class _Member(zipfile.ZipInfo):
-    """A member of 1 January 1980 that states its sizes in 64 bits alone; Python before 3.11.4 states them twice."""
+    """A member dated 1 January 1980 with its sizes in 64 bits only; Python before 3.11.4 writes them twice."""
 
     def FileHeader(self, zip64: bool | None = None) -> bytes:  # noqa: N802 (zipfile's name)
-        """The header before the member's data: both sizes of 32 bits are all ones, which asks for version 4.5."""
+        """The header before the member's data, with both 32-bit sizes all ones, as ZIP version 4.5 requires."""
         self.create_version = self.extract_version = 45
         header = super().FileHeader(zip64)
         return header[:18] + b"\xff" * 8 + header[26:]
 
 
 def read_npz(path: str | Path) -> dict[str, np.ndarray]:
-    """Every array of an NPZ file, by name. Nothing is unpickled. Raises BadInput for anything else."""
+    """Read all arrays of an NPZ file without unpickling. Raises BadInput for any other file."""
     if not Path(path).is_file():
         raise BadInput(path, "an NPZ file", "nothing", "run the stage that writes it")
     try:

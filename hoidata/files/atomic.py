@@ -1,7 +1,4 @@
-"""Writing that leaves either the old file or the whole new one, never half of one; and one writer at a time.
-
-Also content digests and canonical JSON: equal content, equal bytes.
-"""
+"""Atomic writes of files and folders, exclusive locks, content digests and canonical JSON."""
 
 import hashlib
 import json
@@ -19,13 +16,13 @@ from filelock import FileLock, Timeout
 
 from hoidata.errors import BadInput
 
-# A run that was killed may leave workers behind for the moment they need to notice it.
+# Workers of a killed run need a moment to notice it.
 _WAIT_S = 10.0
 
 
 @contextmanager
 def atomic_file(path: str | Path) -> Iterator[Path]:
-    """Give a temporary path beside ``path``; rename it over ``path`` when the block ends without an error."""
+    """Yield a temporary path next to ``path``, and rename it to ``path`` if the block ends without an error."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.{_writer()}-", suffix=".part", dir=path.parent)
@@ -40,7 +37,7 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
 
 
 def write_whole(path: str | Path, content: str | bytes) -> Path:
-    """Write bytes, or text as UTF-8, whole or not at all; gives the file's path."""
+    """Write bytes, or text as UTF-8, atomically. Returns the file's path."""
     with atomic_file(path) as partial:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
     return Path(path)
@@ -48,10 +45,10 @@ def write_whole(path: str | Path, content: str | bytes) -> Path:
 
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """Give an empty temporary folder beside ``path``; put it in the place of ``path`` when the block ends well.
+    """Yield an empty temporary folder next to ``path``, and replace ``path`` by it if the block ends without an error.
 
-    The old folder is moved aside whole before it is deleted: a process killed meanwhile leaves nothing of it here.
-    What writers of ``path`` that were killed left beside it is deleted first.
+    The old folder is renamed before its deletion, so a killed process leaves no partly deleted folder at ``path``.
+    Leftovers of killed writers of ``path`` are deleted first.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -70,31 +67,31 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 
 def remove_leftovers(path: str | Path) -> None:
-    """Delete what killed writers of ``path`` left beside it; an old folder they had moved aside goes back first.
+    """Delete leftovers of killed writers next to ``path``, after restoring an old folder that they had renamed.
 
-    Only for the one who holds ``exclusive(path)``: a living writer's files look the same.
+    Requires ``exclusive(path)``, because a running writer's files look the same.
     """
     _remove(Path(path), _leftovers(Path(path)))
 
 
 def remove_dead_leftovers(path: str | Path) -> None:
-    """As ``remove_leftovers``, of those writers alone whose process on this machine has ended. For everyone."""
-    _remove(Path(path), [left for left in _leftovers(Path(path)) if _is_dead(left.name)])
+    """As ``remove_leftovers``, for writers whose process on this machine has ended. Requires no lock."""
+    _remove(Path(path), [item for item in _leftovers(Path(path)) if _is_dead(item.name)])
 
 
 def _leftovers(path: Path) -> list[Path]:
-    """Temporary files and folders of writers of ``path``, killed or at work."""
+    """Temporary files and folders of writers of ``path``, killed or running."""
     if not path.parent.is_dir():
         return []
     pattern = re.compile(rf"\.{re.escape(path.name)}\.[^.]+\.(part|old)")
     return sorted(item for item in path.parent.iterdir() if pattern.fullmatch(item.name))
 
 
-def _remove(path: Path, left: Iterable[Path]) -> None:
-    for item in left:
+def _remove(path: Path, leftovers: Iterable[Path]) -> None:
+    for item in leftovers:
         if item.suffix == ".old" and not path.exists():
             os.replace(item, path)
-    for item in left:
+    for item in leftovers:
         if item.is_dir() and not item.is_symlink():
             shutil.rmtree(item, ignore_errors=True)  # another process may delete it at this moment
         else:
@@ -106,12 +103,12 @@ def _machine() -> str:
 
 
 def _writer() -> str:
-    """Part of the names of temporary files: this machine and process."""
+    """This machine and process, as part of a temporary file's name."""
     return f"{_machine()}-{os.getpid()}"
 
 
 def _is_dead(name: str) -> bool:
-    """Whether the writer in a temporary file's name was a process of this machine and has ended."""
+    """Whether the writer in a temporary file's name is a process of this machine that has ended."""
     writer = re.search(rf"\.{_machine()}-([0-9]+)-[^.]+\.(part|old)$", name)
     if not writer:
         return False
@@ -126,10 +123,12 @@ def _is_dead(name: str) -> bool:
 
 @contextmanager
 def exclusive(path: str | Path, wait_s: float = _WAIT_S) -> Iterator[int]:
-    """Hold the one right to write ``path``; gives the file descriptor of the lock ``.<name>.lock`` beside it.
+    """Lock ``path`` for writing. Yields the file descriptor of the lock file ``.<name>.lock`` next to it.
 
-    The system frees the lock when the last process that has the descriptor ends, however it ends. Raises BadInput
-    when another process still holds it after ``wait_s`` seconds.
+    The system releases the lock when the last process with the descriptor ends.
+
+    Raises:
+        BadInput: another process still has the lock after ``wait_s`` seconds.
     """
     path, descriptors = Path(path), []
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -141,20 +140,22 @@ def exclusive(path: str | Path, wait_s: float = _WAIT_S) -> Iterator[int]:
         holder = lock.read_text() if lock.exists() else ""
         got = f"process {holder or 'unknown'} at work on it"
         remedy = "wait for that run to end, or end it, and run again"
-        raise BadInput(path, "nobody else to write it", got, remedy) from None
+        raise BadInput(path, "no other writer", got, remedy) from None
     try:
         lock.write_text(str(os.getpid()))
         yield descriptors[0]
     finally:
-        lock.unlink(missing_ok=True)  # while it is held: filelock holds none on a file that has lost its name
+        lock.unlink(missing_ok=True)  # before the release: another process must not lock a deleted file
         holding.release()
 
 
 def sha256_bytes(data: bytes) -> str:
+    """SHA-256 of bytes as hexadecimal digits."""
     return hashlib.sha256(data).hexdigest()
 
 
 def sha256_file(path: str | Path) -> str:
+    """SHA-256 of a file as hexadecimal digits."""
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 

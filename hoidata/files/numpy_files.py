@@ -1,4 +1,4 @@
-"""``.npy`` and ``.npz`` files of others, read without ``allow_pickle``; objects go through ``restricted_load``."""
+"""Reads untrusted ``.npy`` and ``.npz`` files without ``allow_pickle``; ``restricted_load`` reads objects."""
 
 import zipfile
 from collections.abc import Collection, Iterable, Iterator
@@ -14,29 +14,30 @@ from hoidata.files.restricted_pickle import ARRAYS, StoredSize, restricted_load
 
 _MAX_MEMBERS = 256
 _MAX_BYTES = 1 << 30
-# Numbers of recordings shrink to a half or a third, constant ones to a thousandth; those are small.
+# Compression shrinks recorded numbers to a half or a third; constants shrink to a thousandth, but are small.
 _UNPACKED_PER_BYTE = 8
 _FREE_BYTES = 64 << 20
 _FORMAT = "a NumPy file"
 
 
 def load_npy(path: str | Path) -> np.ndarray:
-    """A plain ``.npy`` array; BadInput if it is missing, truncated or holds Python objects."""
+    """Read a plain ``.npy`` array. Raises BadInput if it is missing, truncated or has Python objects."""
     value = _load(path, allow_objects=False)
     assert isinstance(value, np.ndarray)
     return value
 
 
 def load_npy_object(path: str | Path) -> Any:
-    """A ``.npy`` file that may hold Python objects: the object when 0-d (ARCTIC's ``.mano.npy``), else the array."""
+    """Read a ``.npy`` file that may have Python objects: an object if 0-d (ARCTIC's ``.mano.npy``), else an array."""
     return _item(_load(path, allow_objects=True))
 
 
 def load_npz_objects(path: str | Path, members: Collection[str] | None = None) -> dict[str, Any]:
-    """All members of an ``.npz`` (or only those named), 0-d ones as their item: GRAB's sequence files.
+    """Read members of an ``.npz`` file (all by default), 0-d arrays as their item, such as GRAB's sequence files.
 
-    BadInput if a named member is absent, on more than 256 members, and where they unpack to more than 1 GiB, or to more
-    than 64 MiB and eight times the file.
+    Raises:
+        BadInput: a member is absent, there are more than 256 members, or they unpack to more than 1 GiB, or to more
+            than both 64 MiB and eight times the file.
     """
     with open_archive(path) as archive:
         chosen = _chosen_members(path, archive, members)
@@ -45,9 +46,11 @@ def load_npz_objects(path: str | Path, members: Collection[str] | None = None) -
 
 
 def load_npz_arrays(path: str | Path) -> dict[str, np.ndarray]:
-    """All members of an ``.npz`` of plain arrays, by name: a file of ours, of any size.
+    """Read all members of an ``.npz`` file of plain arrays, which hoidata wrote, of any size.
 
-    BadInput on Python objects, and where it unpacks to more than ``load_npz_objects`` reads and more than its own size.
+    Raises:
+        BadInput: it has Python objects, or unpacks to more than both the file's size and the limit of
+            ``load_npz_objects``.
     """
     with open_archive(path) as archive:
         infos = archive.infolist()
@@ -57,7 +60,7 @@ def load_npz_arrays(path: str | Path) -> dict[str, np.ndarray]:
 
 @contextmanager
 def open_archive(path: str | Path) -> Iterator[zipfile.ZipFile]:
-    """The archive ``path``; whatever a damaged one raises becomes a BadInput that names it."""
+    """Open an archive; any error of a damaged archive becomes a BadInput with its path."""
     try:
         with zipfile.ZipFile(path) as archive:
             yield archive
@@ -70,12 +73,12 @@ def open_archive(path: str | Path) -> Iterator[zipfile.ZipFile]:
 def _read_member(
     path: str | Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, stored: StoredSize | None
 ) -> np.ndarray:
-    """stored: what objects in the archive may cost; None where there may be none."""
-    where = f"{path}: {info.filename.removesuffix('.npy')}"
+    """Read one member. ``stored`` limits the cost of objects in the archive; None forbids objects."""
+    source = f"{path}: {info.filename.removesuffix('.npy')}"
     with archive.open(info) as stream:
-        array = _read(stream, where, info.file_size, stored)
-        if stream.read(1):  # at the end the checksum is compared, too
-            raise BadInput(where, "nothing behind the array", "more bytes")
+        array = _read(stream, source, info.file_size, stored)
+        if stream.read(1):  # the end of the stream also checks the checksum
+            raise BadInput(source, "nothing behind the array", "more bytes")
     return array
 
 
@@ -96,14 +99,14 @@ def _chosen_members(
     return infos
 
 
-def _check_size(path: str | Path, infos: Iterable[zipfile.ZipInfo], always: int = 0) -> None:
-    """Raise BadInput where members unpack to too much for an archive of this size. always: bytes that are allowed."""
+def _check_size(path: str | Path, infos: Iterable[zipfile.ZipInfo], min_limit: int = 0) -> None:
+    """Raise BadInput if members unpack to more than an archive of this size may, and more than ``min_limit`` bytes."""
     size = sum(info.file_size for info in infos)
     by_size = max(_FREE_BYTES, _UNPACKED_PER_BYTE * Path(path).stat().st_size)
-    most = max(always, min(_MAX_BYTES, by_size))
-    if size > most:
+    limit = max(min_limit, min(_MAX_BYTES, by_size))
+    if size > limit:
         raise BadInput(
-            path, f"at most {most} bytes when unpacked", str(size), "download it again, or store it uncompressed"
+            path, f"at most {limit} bytes when unpacked", str(size), "download it again, or store it uncompressed"
         )
 
 
@@ -116,16 +119,16 @@ def _load(path: str | Path, allow_objects: bool) -> np.ndarray:
         raise BadInput(path, _FORMAT, f"{type(error).__name__}: {error.strerror}") from None
 
 
-def _read(stream: Any, where: str | Path, size: int, stored: StoredSize | None) -> np.ndarray:
-    """The array in a stream of ``size`` bytes. stored: what its objects may cost; None where it may have none."""
-    header = read_npy_header(stream, where)
+def _read(stream: Any, source: str | Path, size: int, stored: StoredSize | None) -> np.ndarray:
+    """Read the array in a stream of ``size`` bytes. ``stored`` limits the cost of objects; None forbids objects."""
+    header = read_npy_header(stream, source)
     if not header.dtype.hasobject:
-        return read_plain_array(stream, header, size - stream.tell(), where)
+        return read_plain_array(stream, header, size - stream.tell(), source)
     if stored is None:
-        raise BadInput(where, "an array of numbers", "Python objects")
-    value = restricted_load(stream, ARRAYS, where=where, archive=stored)
+        raise BadInput(source, "an array of numbers", "Python objects")
+    value = restricted_load(stream, ARRAYS, path=source, archive=stored)
     if not isinstance(value, np.ndarray):
-        raise BadInput(where, "a pickled array", type(value).__name__)
+        raise BadInput(source, "a pickled array", type(value).__name__)
     return value
 
 

@@ -1,28 +1,28 @@
-"""A look at a pickle's opcodes before any of them is executed: a walk over its stack that notes what lies there.
+"""Checks a pickle's opcodes before execution, by a simulation of the types on its stack.
 
-An allow-list of names does not stop a small file from ending the process or from keeping it busy for ever. Tuples
-nested 500,000 deep as a key of a dictionary overflow the C stack when they are hashed, and tuples that hold the one
-before twice take 2^depth steps. Python hashes an integer to its remainder by 2^61 - 1 and a frozenset to a mixture of
-its members' hashes, so thousands of either can share one hash, and each new key is compared with all before it. A memo
-index may ask for any amount of memory. So keys are no tuples, frozensets or integers beyond 64 bits (of those that are
-left at most some dozens share a hash: texts have random ones), and indices are small.
+An allow-list of globals does not stop a small file from crashing the process or from running forever. Hashing a key of
+tuples nested 500,000 deep overflows the C stack. Tuples that contain the previous tuple twice take 2^depth steps.
+Python's hash of an integer is its remainder by 2^61 - 1, and that of a frozenset combines its members' hashes. So
+thousands of keys can share a hash, and each new key is compared with all others. A memo index can allocate any amount
+of memory. The check therefore refuses tuples, frozensets and integers beyond 64 bits as keys, and large memo indices.
+Of the remaining keys, at most some dozens can share a hash.
 """
 
 import pickle
 import pickletools
 from typing import Any
 
-# Never written by the tools we read from, or able to reach beyond the allow-list; LONG4 holds numbers over 2^2000.
+# The supported tools never write these, or they bypass the allow-list; LONG4 is for numbers over 2^2000.
 REFUSED_OPCODES = frozenset(
     {"PERSID", "BINPERSID", "EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEXT_BUFFER", "READONLY_BUFFER"} | {"DUP", "LONG4"}
 )
-_MOST_OPCODES = 400_000  # about a second; numbers lie within few opcodes, a tensor takes about 50
-_BYTES_PER_OPCODE = 8  # stored, of large files: one of 4,000 frames of 16 tensors each has 13 bytes per opcode
+_MAX_OPCODES = 400_000  # about a second; arrays take few opcodes, a tensor about 50
+_BYTES_PER_OPCODE = 8  # of large files; one with 4,000 frames of 16 tensors has 13 bytes per opcode
 _PUT_OPCODES = {"PUT", "BINPUT", "LONG_BINPUT"}
 _GET_OPCODES = {"GET", "BINGET", "LONG_BINGET"}
 _TUPLES = {"TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "EMPTY_TUPLE"}
 _INTEGERS = {"INT", "LONG", "LONG1"}
-# What lies on the stack; the first three are refused as keys.
+# Types on the simulated stack; the first three are refused as keys.
 _TUPLE = "tuple"
 _FROZENSET = "frozenset"
 _LARGE = "number beyond 64 bits"
@@ -32,24 +32,29 @@ _MARK = "mark"
 
 
 class OpcodeLimit:
-    """How many opcodes the pickles of one file may have together. n_stored: bytes of the file, compressed or not."""
+    """Budget of opcodes for all pickles in one file of ``n_stored`` bytes, compressed or not."""
 
     def __init__(self, n_stored: int) -> None:
-        self.most = self.left = max(_MOST_OPCODES, n_stored // _BYTES_PER_OPCODE)
+        self.max_opcodes = self.n_left = max(_MAX_OPCODES, n_stored // _BYTES_PER_OPCODE)
 
     def spend(self) -> None:
-        self.left -= 1
-        if self.left < 0:
-            raise pickle.UnpicklingError(f"it has more than {self.most} opcodes")
+        """Count one opcode. Raises UnpicklingError above the limit."""
+        self.n_left -= 1
+        if self.n_left < 0:
+            raise pickle.UnpicklingError(f"it has more than {self.max_opcodes} opcodes")
 
 
 def check_opcodes(data: bytes, limit: OpcodeLimit | None = None) -> None:
-    """Refuse opcodes we never need, memo indices beyond the file's length, and keys that take long to hash or compare.
+    """Refuse unneeded opcodes, memo indices beyond the file's length, and keys that are slow to hash or compare.
 
-    limit: of the file that ``data`` comes from; ``data`` is the whole file where it is not given.
-    Raises UnpicklingError, or what pickletools raises on something that is no pickle.
+    Args:
+        data: the pickle.
+        limit: budget of the file with the pickle; by default ``data`` is the whole file.
+
+    Raises:
+        UnpicklingError: the pickle is refused. For malformed pickles, pickletools raises other exceptions too.
     """
-    walk, limit = _Walk(), limit or OpcodeLimit(len(data))
+    walk, limit = _StackSimulation(), limit or OpcodeLimit(len(data))
     for opcode, argument, _ in pickletools.genops(data):
         limit.spend()
         if opcode.name in REFUSED_OPCODES:
@@ -59,14 +64,15 @@ def check_opcodes(data: bytes, limit: OpcodeLimit | None = None) -> None:
         walk.step(opcode, argument)
 
 
-class _Walk:
-    """The stack of an unpickler with, in the place of each value, whether it is one that may be no key."""
+class _StackSimulation:
+    """Simulates an unpickler's stack and memo with the type of each value."""
 
     def __init__(self) -> None:
         self.stack: list[str] = []
         self.memo: dict[int, str] = {}
 
     def step(self, opcode: Any, argument: Any) -> None:
+        """Simulate one opcode. Raises UnpicklingError for a refused key."""
         name = opcode.name
         if name in _PUT_OPCODES or name == "MEMOIZE":
             self.memo[len(self.memo) if name == "MEMOIZE" else argument] = self._top()
@@ -78,43 +84,43 @@ class _Walk:
             self._top()
             self.stack.pop()
         else:
-            self._replace(opcode, argument)
+            self._apply(opcode, argument)
 
-    def _replace(self, opcode: Any, argument: Any) -> None:
-        """Take what an opcode takes, check the keys among it, and leave what it leaves."""
-        taken = self._taken(opcode)
+    def _apply(self, opcode: Any, argument: Any) -> None:
+        """Pop an opcode's operands, check keys among them, and push its results."""
+        taken = self._pop_operands(opcode)
         for key in _hashed(opcode.name, taken):
             if key in _REFUSED_KEYS:
                 raise pickle.UnpicklingError(f"a {key} as a key, which is not allowed")
         self.stack += [_kind(opcode.name, argument)] * len(opcode.stack_after)
 
-    def _taken(self, opcode: Any) -> list[str]:
-        wanted = opcode.stack_before
-        if pickletools.markobject not in wanted:
-            count = len(wanted)
+    def _pop_operands(self, opcode: Any) -> list[str]:
+        operands = opcode.stack_before
+        if pickletools.markobject not in operands:
+            count = len(operands)
         else:
-            below = wanted.index(pickletools.markobject)
+            below = operands.index(pickletools.markobject)
             count = below + len(self.stack) - self._last_mark()
         if count > len(self.stack):
-            raise pickle.UnpicklingError("it takes more than there is")
+            raise pickle.UnpicklingError("it takes more values than its stack has")
         taken = self.stack[len(self.stack) - count :]
         del self.stack[len(self.stack) - count :]
         return taken
 
     def _last_mark(self) -> int:
-        for place in range(len(self.stack) - 1, -1, -1):
-            if self.stack[place] is _MARK:
-                return place
-        raise pickle.UnpicklingError("it takes all since a mark that is not there")
+        for index in range(len(self.stack) - 1, -1, -1):
+            if self.stack[index] is _MARK:
+                return index
+        raise pickle.UnpicklingError("it takes all values since a missing mark")
 
     def _top(self) -> str:
         if not self.stack:
-            raise pickle.UnpicklingError("it takes more than there is")
+            raise pickle.UnpicklingError("it takes more values than its stack has")
         return self.stack[-1]
 
 
 def _kind(name: str, argument: Any) -> str:
-    """What an opcode leaves on the stack."""
+    """The type that an opcode pushes."""
     if name in _TUPLES:
         return _TUPLE
     if name == "FROZENSET":
@@ -128,7 +134,7 @@ def is_large(number: int) -> bool:
 
 
 def _hashed(name: str, taken: list[str]) -> list[str]:
-    """Which of the values an opcode takes become keys or members of a set."""
+    """The operands of an opcode that become keys or members of a set."""
     if name == "SETITEM":
         return taken[1:2]
     if name in ("SETITEMS", "DICT"):

@@ -1,7 +1,7 @@
-"""Read pickles and NumPy files of others without executing anything in them.
+"""Reads untrusted pickles and NumPy files without executing anything in them.
 
-A pickle may only name the (module, name) pairs of an allow-list, and each is mapped to a function of ours that checks
-its arguments; everything else is refused before it is looked up. Every problem is a ``BadInput`` that names the file.
+A pickle may only reference the (module, name) pairs of an allow-list. Each pair maps to a function of hoidata that
+checks its arguments. Any other reference is refused before it is resolved. All errors are ``BadInput`` with the file.
 """
 
 import io
@@ -21,57 +21,64 @@ from hoidata.files.pickle_check import OpcodeLimit, check_opcodes, is_large
 
 MAX_BYTES = 2 << 30
 _PIECE_BYTES = 1 << 20
-# What calls in a pickle make may take twice its bytes, twice those it is stored in and this: a call can be repeated in
-# a few bytes, and a compressed member may unpack to a thousand times its size.
+# Values may take twice the pickle's bytes, plus twice the file's, plus this: a few bytes can repeat a call, and a
+# compressed member may unpack to a thousand times its size.
 _GROWTH = 2
 _FREE_BYTES = 64 << 20
 Allow = Mapping[tuple[str, str], Any]
 
-_REMEDY = "download it again from the dataset's own site; it is not opened otherwise, because it could run code"
+_REMEDY = "download it again from the dataset's own site; hoidata refuses to open it, because it could run code"
 
 
 def restricted_load(
     source: bytes | BinaryIO,
     allow: Allow,
     encoding: str = "ASCII",
-    where: str | Path = "pickle",
+    path: str | Path = "pickle",
     max_bytes: int = MAX_BYTES,
     archive: "StoredSize | None" = None,
 ) -> Any:
-    """Unpickle ``source`` with only the globals of ``allow``; arrays come back as plain ``numpy.ndarray``.
+    """Unpickle data with only the globals of an allow-list; arrays become plain ``numpy.ndarray``.
 
-    allow: (module, name) -> what stands for it; ``ARRAYS`` covers arrays in containers. encoding: "latin1" for files
-    written by Python 2. archive: of a pickle inside a compressed file. Raises BadInput for anything malformed,
-    oversized or not allowed.
+    Args:
+        source: the pickle.
+        allow: replacement of each allowed (module, name); ``ARRAYS`` allows arrays in containers.
+        encoding: "latin1" for files written by Python 2.
+        path: names the file in errors.
+        max_bytes: limit of the pickle's size.
+        archive: shared limits of all pickles in one compressed file.
+
+    Raises:
+        BadInput: the pickle is malformed, too large or not allowed.
     """
     data = source if isinstance(source, bytes) else read_at_most(source, max_bytes + 1)
     if len(data) > max_bytes:
-        raise BadInput(where, f"at most {max_bytes} bytes", "more", _REMEDY)
+        raise BadInput(path, f"at most {max_bytes} bytes", "more", _REMEDY)
     try:
         archive = archive or StoredSize(len(data))
         check_opcodes(data, limit=archive.opcodes)
-        most = _GROWTH * (len(data) + archive.n_bytes) + _FREE_BYTES
-        value = _Unpickler(io.BytesIO(data), allow, encoding, Budget(most)).load()
-        _written_out(value, {}, most)
-        return _plain(value, {})
+        limit = _GROWTH * (len(data) + archive.n_bytes) + _FREE_BYTES
+        value = _Unpickler(io.BytesIO(data), allow, encoding, Budget(limit)).load()
+        _expanded_size(value, {}, limit)
+        return _with_plain_arrays(value, {})
     except BadInput:
         raise
     except Exception as error:  # a malformed pickle can raise anything
         text = f"{type(error).__name__}: {error}"
-        raise BadInput(where, "a pickle of arrays, containers, numbers and strings", text, _REMEDY) from None
+        raise BadInput(path, "a pickle of arrays, containers, numbers and strings", text, _REMEDY) from None
 
 
 def read_at_most(stream: BinaryIO, size: int) -> bytes:
-    """As ``stream.read(size)``, which allocates ``size`` bytes before it looks how many there are."""
-    pieces, left = [], size
-    while left and (piece := stream.read(min(left, _PIECE_BYTES))):
+    """Read up to ``size`` bytes in pieces, because ``stream.read(size)`` allocates ``size`` bytes in advance."""
+    pieces, n_left = [], size
+    while n_left and (piece := stream.read(min(n_left, _PIECE_BYTES))):
         pieces.append(piece)
-        left -= len(piece)
+        n_left -= len(piece)
     return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
 
 class StoredSize:
-    """What the pickles in one archive may cost together, by the bytes of the archive itself."""
+    """Shared limits of all pickles in one archive, from the archive's size."""
 
     def __init__(self, n_bytes: int) -> None:
         self.n_bytes = n_bytes
@@ -82,11 +89,12 @@ class Budget:
     """Bytes that may still be allocated for one file."""
 
     def __init__(self, n_bytes: int) -> None:
-        self.left = n_bytes
+        self.n_left = n_bytes
 
     def spend(self, n_bytes: int) -> None:
-        self.left -= n_bytes
-        if self.left < 0:
+        """Count an allocation. Raises UnpicklingError above the budget."""
+        self.n_left -= n_bytes
+        if self.n_left < 0:
             raise pickle.UnpicklingError("values that are together far larger than the file")
 
 
@@ -97,6 +105,7 @@ class _Unpickler(pickle.Unpickler):
         self._budget = budget
 
     def find_class(self, module: str, name: str) -> Any:
+        """Resolve a global by the allow-list."""
         try:
             allowed = self._allow[module, name]
         except KeyError:
@@ -108,7 +117,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 class StandIn:
-    """Something a pickle may name or pass on but not change (BUILD), and that no result holds."""
+    """A value that a pickle may reference or pass on, but not change (BUILD) or return in a result."""
 
     __slots__ = ()
 
@@ -117,7 +126,7 @@ class StandIn:
 
 
 class _Callable(StandIn):
-    """An allowed function that a pickle can call and nothing else: BUILD on it could set its defaults for all files."""
+    """An allowed function that a pickle can only call, because BUILD could change its defaults for all files."""
 
     __slots__ = ("_budget", "_function")
 
@@ -135,30 +144,32 @@ class _Callable(StandIn):
         return result
 
 
-def _written_out(value: Any, known: dict[int, int | None], most: int) -> int:
-    """Bytes a value takes with all it shares written out, as NumPy makes one array of lists of lists.
+def _expanded_size(value: Any, sizes: dict[int, int | None], limit: int) -> int:
+    """Size of a value in bytes if shared items are copied, as NumPy does for an array of nested lists.
 
-    A few hundred bytes of pickle can hold one list 2^60 times. Raises UnpicklingError above ``most`` and for values
-    that hold themselves.
+    A pickle of a few hundred bytes can contain one list 2^60 times. ``sizes`` caches sizes by id.
+
+    Raises:
+        UnpicklingError: the size exceeds ``limit``, or the value contains itself.
     """
     if isinstance(value, str | bytes | bytearray):
         return len(value)
-    if id(value) not in known:  # first: to list what an array of objects holds takes as long as it is large
+    if id(value) not in sizes:  # first, because listing the items of an object array takes linear time
         items = _items(value)
         if not len(items):
             return value.nbytes if isinstance(value, np.ndarray) else 8
-        known[id(value)] = None
-        known[id(value)] = 8 + sum(_written_out(item, known, most) for item in items)
-    size = known[id(value)]
+        sizes[id(value)] = None
+        sizes[id(value)] = 8 + sum(_expanded_size(item, sizes, limit) for item in items)
+    size = sizes[id(value)]
     if size is None:
         raise pickle.UnpicklingError("a value that holds itself")
-    if size > most:
+    if size > limit:
         raise pickle.UnpicklingError("values that are, written out, far larger than the file")
     return size
 
 
 def _items(value: Any) -> Collection[Any]:
-    """What a value holds, keys of dictionaries and members of sets apart, which are small."""
+    """The items of a value, without keys of dictionaries and members of sets, which are small."""
     if isinstance(value, dict):
         return value.values()
     if isinstance(value, np.ndarray):
@@ -168,43 +179,43 @@ def _items(value: Any) -> Collection[Any]:
     return value if isinstance(value, list | tuple) else ()
 
 
-def _plain(value: Any, seen: dict[int, tuple[Any, Any]]) -> Any:
-    """The same value with our array class replaced by ``numpy.ndarray``.
+def _with_plain_arrays(value: Any, visited: dict[int, tuple[Any, Any]]) -> Any:
+    """Replace ``CheckedArray`` by ``numpy.ndarray`` in a value.
 
-    ``seen`` maps the id of each value to (value, result), so that shared and cyclic ones are visited once.
+    ``visited`` maps the id of each value to (value, result), so that shared and cyclic values are visited once.
     """
-    if id(value) in seen:
-        return seen[id(value)][1]
+    if id(value) in visited:
+        return visited[id(value)][1]
     if isinstance(value, CheckedArray):
         result = value.view(np.ndarray)
-        seen[id(value)] = value, result
+        visited[id(value)] = value, result
         if result.dtype.hasobject:
             for index, item in enumerate(list(result.flat)):
-                result.flat[index] = _plain(item, seen)
+                result.flat[index] = _with_plain_arrays(item, visited)
         return result
     if isinstance(value, tuple):
-        result = tuple(_plain(item, seen) for item in value)
-        seen[id(value)] = value, result
+        result = tuple(_with_plain_arrays(item, visited) for item in value)
+        visited[id(value)] = value, result
         return result
     if isinstance(value, StandIn | _DtypeRecord):
         raise pickle.UnpicklingError(f"it holds a {type(value).__name__} by itself")
     if isinstance(value, dict | list | Record):
-        seen[id(value)] = value, value
-        _make_items_plain(value, seen)
+        visited[id(value)] = value, value
+        _replace_items(value, visited)
     return value
 
 
-def _make_items_plain(value: "dict | list | Record", seen: dict[int, tuple[Any, Any]]) -> None:
+def _replace_items(value: "dict | list | Record", visited: dict[int, tuple[Any, Any]]) -> None:
     if isinstance(value, dict):
-        value.update({key: _plain(item, seen) for key, item in value.items()})
+        value.update({key: _with_plain_arrays(item, visited) for key, item in value.items()})
     elif isinstance(value, list):
-        value[:] = [_plain(item, seen) for item in value]
+        value[:] = [_with_plain_arrays(item, visited) for item in value]
     else:
-        value.state = _plain(value.state, seen)
+        value.state = _with_plain_arrays(value.state, visited)
 
 
 class Record:
-    """Inert stand-in for a foreign class: keeps the pickled state in ``state`` and does nothing."""
+    """Inert replacement of a foreign class, which only stores the pickled state."""
 
     state: Any = None
 
@@ -228,16 +239,16 @@ class CheckedArray(np.ndarray):
             raw = _as_bytes(raw)
             check_text(raw, kind)
         # NumPy trusts the length of an object array's list and reads past its end.
-        wanted = math.prod(shape) * (1 if kind.hasobject else kind.itemsize)
-        if len(raw) != wanted:
-            raise pickle.UnpicklingError(f"an array of shape {tuple(shape)} with {len(raw)} in the place of {wanted}")
+        length = math.prod(shape) * (1 if kind.hasobject else kind.itemsize)
+        if len(raw) != length:
+            raise pickle.UnpicklingError(f"an array of shape {tuple(shape)} with {len(raw)} in the place of {length}")
         if self.budget is not None:
             self.budget.spend(len(raw) * (kind.itemsize if kind.hasobject else 1))
         super().__setstate__((1, tuple(shape), kind, bool(is_fortran), raw))  # type: ignore[arg-type]
 
 
 class _DtypeRecord:
-    """A dtype built from a checked string; its state may only set the byte order."""
+    """A dtype from a checked string; BUILD may only set its byte order."""
 
     def __init__(self, dtype: np.dtype) -> None:
         self.dtype = dtype
@@ -250,7 +261,7 @@ class _DtypeRecord:
 
 
 class _NdarrayType(StandIn):
-    """Stands for ``numpy.ndarray`` where a pickle names it as the type to rebuild; cannot be called or changed."""
+    """Replaces ``numpy.ndarray`` as the type to rebuild; it cannot be called or changed."""
 
     __slots__ = ()
 
@@ -270,7 +281,7 @@ def _checked_dtype(value: Any) -> np.dtype:
 
 
 def _as_bytes(raw: Any) -> bytes:
-    """Array data as bytes; Python 2 strings arrive as latin1 text."""
+    """Array data as bytes; Python 2 strings are latin1 text."""
     if isinstance(raw, str):
         return raw.encode("latin1")
     if isinstance(raw, bytes | bytearray):
@@ -322,7 +333,7 @@ def _set(items: Any = ()) -> set:
 
 
 def checked_keys(items: Sequence[Any]) -> Sequence[Any]:
-    """The items, known not to be tuples and others that hashing can take for ever (see pickle_check)."""
+    """The items, after a check that each is quick to hash (see pickle_check)."""
     for item in items:
         if isinstance(item, tuple | frozenset) or (isinstance(item, int) and is_large(item)):
             raise pickle.UnpicklingError(f"a {type(item).__name__} as a key, which is not allowed")
@@ -330,7 +341,7 @@ def checked_keys(items: Sequence[Any]) -> Sequence[Any]:
 
 
 def _numpy_globals() -> dict[tuple[str, str], Any]:
-    """NumPy 1 calls its inner package ``numpy.core``, NumPy 2 ``numpy._core``; files of both are read."""
+    """Globals of arrays for NumPy 1 (``numpy.core``) and NumPy 2 (``numpy._core``)."""
     allowed: dict[tuple[str, str], Any] = {("numpy", "ndarray"): _NDARRAY, ("numpy", "dtype"): _dtype}
     for core in ("numpy.core", "numpy._core"):
         allowed[f"{core}.multiarray", "_reconstruct"] = _reconstruct

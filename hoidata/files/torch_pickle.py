@@ -1,11 +1,11 @@
-"""Read plain pickles that hold torch tensors (TACO's hand files, OakInk2's annotations) without executing anything.
+"""Reads plain pickles of torch tensors (TACO's hand files, OakInk2's annotations) without executing anything.
 
-``pickle.dump`` of a tensor writes a call of ``torch.storage._load_from_bytes`` on the bytes of ``torch.save`` in its
-legacy format: five pickles (magic number, protocol, system, the storage as a persistent id, keys), the number of
-elements and the elements. torch itself would open those bytes with an unrestricted unpickler; here the outer pickle is
-read by rules of ours, the bytes by torch's ``weights_only`` loading, once it is known that they name nothing but a
-storage and claim no more than there is. Tensors come back as NumPy arrays. The very bytes that torch writes for a small
-storage are known by their form and read at once: a recording of OakInk2 has a hundred thousand of them.
+``pickle.dump`` of a tensor writes a call of ``torch.storage._load_from_bytes`` on the bytes of ``torch.save`` in the
+legacy format. These are five pickles (magic number, protocol, system, the storage as a persistent id, keys), the number
+of elements, and the elements. torch would load them with an unrestricted unpickler. Here ``restricted_load`` reads the
+outer pickle. ``torch.load(weights_only=True)`` reads the bytes, after a check that they reference only a storage and
+state no length beyond the data. Tensors become NumPy arrays. A regular expression parses the common form of a small
+storage, because a recording of OakInk2 has a hundred thousand storages.
 """
 
 import io
@@ -33,23 +33,23 @@ from hoidata.files.restricted_pickle import (
 )
 
 MAX_FILE_BYTES = 256 << 20
-# Tensors may repeat elements (``expand``); together they may be this much larger than the file.
+# Tensors may repeat elements (``expand``); in total they may exceed the file by this much.
 _REPEATED_BYTES = 64 << 20
 _MAX_DIMENSIONS = 8
 _MAGIC = 0x1950A86A20F9469CFC6C
-_LEAST_LENGTH = 1001  # the protocol's number is as large, in the storage of a single element too
+_LEAST_LENGTH = 1001  # the protocol's number, which is also in the storage of a single element
 _LEGACY_PICKLES = 5
-_MOST_OPCODES = 1000  # of each; torch writes 30 at most
+_MAX_OPCODES = 1000  # of each pickle; torch writes 30 at most
 _REFUSED_IN_STORAGES = REFUSED_OPCODES - {"BINPERSID"} | {"STACK_GLOBAL", "REDUCE", "NEWOBJ", "NEWOBJ_EX", "BUILD"}
-# torch up to 1.9 names CUDA storages as classes of torch.cuda; later ones by their location only. BFloat16 and
-# quantised storages have no NumPy type.
+# torch up to 1.9 stores CUDA storages as classes of torch.cuda, later versions by location. BFloat16 and quantized
+# storages have no NumPy type.
 STORAGE_NAMES = frozenset(
     f"{module} {kind}Storage"
     for module in ("torch", "torch.cuda")
     for kind in ("Double", "Float", "Half", "Long", "Int", "Short", "Char", "Byte", "Bool")
 )
-# A storage as torch writes it on a little-endian machine: its kind, key, length as an opcode, key, length, elements.
-_USUAL_STORAGE = re.compile(
+# A storage that torch wrote on a little-endian machine: its kind, key, length as an opcode, key, length, elements.
+_COMMON_STORAGE = re.compile(
     b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.\x80\x02}q\x00"
     rb"\(X\x10\0\0\0protocol_versionq\x01M\xe9\x03X\r\0\0\0little_endianq\x02\x88X\n\0\0\0type_sizesq\x03}q\x04"
     rb"\(X\x05\0\0\0shortq\x05K\x02X\x03\0\0\0intq\x06K\x04X\x04\0\0\0longq\x07K\x04uu\."
@@ -60,26 +60,33 @@ _USUAL_STORAGE = re.compile(
 )
 
 
-def load_torch_pickle(source: str | Path | bytes, where: str | Path, arrays: bool = False) -> Any:
-    """The object in a plain pickle of torch tensors, each tensor as an own ``numpy.ndarray`` on the CPU.
+def load_torch_pickle(source: str | Path | bytes, path: str | Path, arrays: bool = False) -> Any:
+    """Load a plain pickle of torch tensors, parameters and ordered dictionaries in dicts, lists and tuples.
 
-    source: the file's path or its bytes; ``where`` names it in errors. Tensors of any device, parameters and ordered
-    dictionaries are read, inside dicts, lists and tuples; ``arrays``: NumPy's arrays too. Raises BadInput for anything
-    else: other globals, other storage types, tensors that reach outside their storage, files over 256 MiB.
+    Args:
+        source: path or bytes of the file.
+        path: names the file in errors.
+        arrays: allow NumPy arrays too.
+
+    Returns:
+        The object, with a separate ``numpy.ndarray`` for each tensor.
+
+    Raises:
+        BadInput: other globals, other storage types, tensors that exceed their storage, or files over 256 MiB.
     """
     try:
         stream = io.BytesIO(source) if isinstance(source, bytes) else open(source, "rb")  # noqa: SIM115
     except OSError as error:
-        raise BadInput(where, "a pickle of tensors", f"{type(error).__name__}: {error.strerror}") from None
+        raise BadInput(path, "a pickle of tensors", f"{type(error).__name__}: {error.strerror}") from None
     with stream:
         data = read_at_most(stream, MAX_FILE_BYTES + 1)
     allow = {**tensor_globals(len(data)), **(ARRAYS if arrays else {})}
-    return restricted_load(data, allow, where=where, max_bytes=MAX_FILE_BYTES)
+    return restricted_load(data, allow, path=path, max_bytes=MAX_FILE_BYTES)
 
 
 def tensor_globals(n_bytes: int) -> Allow:
-    """The exact allow-list of one file of ``n_bytes``, which also limits how large its tensors get together."""
-    budget = Budget(2 * n_bytes + _REPEATED_BYTES)  # every storage, and every tensor of them
+    """The allow-list of one file of ``n_bytes``, which also limits the total size of its tensors."""
+    budget = Budget(2 * n_bytes + _REPEATED_BYTES)  # storages, and the tensors on them
 
     def load_from_bytes(data: Any) -> _Storage:
         return _load_from_bytes(budget, data)
@@ -96,7 +103,7 @@ def tensor_globals(n_bytes: int) -> Allow:
 
 
 class _Storage(StandIn):
-    """The elements of one storage, (element,). A pickle can only hand it on."""
+    """The elements of one storage, (element,), which a pickle can only pass on."""
 
     __slots__ = ("elements",)
 
@@ -138,13 +145,13 @@ def _ordered_dict(items: Any = ()) -> dict:
 
 
 def _load_from_bytes(budget: Budget, data: Any) -> _Storage:
-    """The storage in bytes written by ``torch.save(storage, _use_new_zipfile_serialization=False)``."""
+    """Load the storage in bytes written by ``torch.save(storage, _use_new_zipfile_serialization=False)``."""
     if not isinstance(data, bytes):
         raise pickle.UnpicklingError(f"a {type(data).__name__} in the place of a storage")
-    budget.spend(len(data))  # a pickle can ask for the same bytes many times
-    usual = _usual_elements(data)
-    if usual is not None:
-        return _Storage(usual)
+    budget.spend(len(data))  # a pickle can load the same bytes many times
+    elements = _parse_common_storage(data)
+    if elements is not None:
+        return _Storage(elements)
     _check_storage(data)
     import torch
 
@@ -154,13 +161,13 @@ def _load_from_bytes(budget: Budget, data: Any) -> _Storage:
     return _Storage(torch.empty(0, dtype=storage.dtype).set_(storage._untyped_storage).numpy())
 
 
-def _usual_elements(data: bytes) -> np.ndarray | None:
-    """(element,) of a storage in the very bytes torch writes; None for anything else, which may still be one."""
-    found = _USUAL_STORAGE.match(data)
-    if found is None or found["length"][0] != len(found["key"]):
+def _parse_common_storage(data: bytes) -> np.ndarray | None:
+    """(element,) of a storage in the common form of torch; None for other bytes, which may still be a storage."""
+    match = _COMMON_STORAGE.match(data)
+    if match is None or match["length"][0] != len(match["key"]):
         return None
-    kind, short, long, number = found[1], found[4], found[5], found[6]
-    elements = data[found.end() :]
+    kind, short, long, number = match[1], match[4], match[5], match[6]
+    elements = data[match.end() :]
     count = int.from_bytes(short or long, "little")
     dtype = np.dtype("<f4" if kind == b"Float" else "<f8")
     if int.from_bytes(number, "little") != count or len(elements) != count * dtype.itemsize:
@@ -169,11 +176,11 @@ def _usual_elements(data: bytes) -> np.ndarray | None:
 
 
 def _check_storage(data: bytes) -> None:
-    """Refuse what no storage needs; torch allocates the length a storage claims before it looks how much there is."""
+    """Refuse what a storage does not need. torch allocates the stated length before it checks the data."""
     stream = io.BytesIO(data)
     for _ in range(_LEGACY_PICKLES):
         for number, (opcode, argument, _place) in enumerate(pickletools.genops(stream)):
             is_large = isinstance(argument, int) and _MAGIC != argument > max(len(data), _LEAST_LENGTH)
             is_foreign = opcode.name == "GLOBAL" and argument not in STORAGE_NAMES
-            if number > _MOST_OPCODES or is_large or is_foreign or opcode.name in _REFUSED_IN_STORAGES:
+            if number > _MAX_OPCODES or is_large or is_foreign or opcode.name in _REFUSED_IN_STORAGES:
                 raise pickle.UnpicklingError(f"a storage with {opcode.name} {argument}, which is not allowed"[:120])

@@ -1,4 +1,4 @@
-"""JSON and Parquet files that stages write, and read back; what is damaged is told, never shown as if it were sound."""
+"""Reads and writes the JSON and Parquet files of stages. Damaged files raise an error with a remedy."""
 
 import hashlib
 import json
@@ -13,24 +13,22 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 REMEDY = "restore it with `dvc checkout`, or run the stage that writes it again"
-EMPTY = "empty.json"  # in the folder of a stage that had nothing to do, with the reason
-# Who knows the MD5 a file was written with is asked before the file is read; nobody by default.
-_known_by: list[Callable[[Path], str | None]] = []
+EMPTY = "empty.json"  # the output of a stage that had nothing to do, with the reason
+# Functions that return the recorded MD5 of a file, which is verified before the file is read; none by default.
+_digest_sources: list[Callable[[Path], str | None]] = []
 
 
-# What an entry of a JSON file has to be: a type, several, or the entries of an object with what each has to be.
+# The expected type of a JSON entry: a type, several types, or the entries of an object with their types.
 Shape = type | tuple[type, ...] | Mapping[str, "Shape"]
 NUMBER = (int, float)
 NUMBER_OR_NONE = (int, float, type(None))
 
 
 class Facts(dict[str, Any]):
-    """A JSON object of ours, and the objects inside. A missing entry is a BadInput that names the file and the key.
-
-    key: of this object in its file, with a full stop at the end; "" for the whole file.
-    """
+    """A JSON object that hoidata wrote. A missing entry raises BadInput with the file and the key."""
 
     def __init__(self, path: Path, values: Mapping[str, Any], key: str = "") -> None:
+        """Wrap an object and its nested objects; ``key`` is its location in the file: "" or a path such as "a.b."."""
         super().__init__(values)
         for name, value in values.items():
             if isinstance(value, dict):
@@ -47,31 +45,33 @@ class Facts(dict[str, Any]):
         return type(self), (self.path, dict(self), self.key)
 
     def check(self, shape: Mapping[str, Shape]) -> "Facts":
-        """This object, after a look at the entries of ``shape``. Raises BadInput for one that is missing or another."""
-        for name, wanted in shape.items():
+        """Check entries, and return self. Raises BadInput for a missing entry or another type."""
+        for name, expected in shape.items():
             value = self[name]
-            kinds = (dict,) if isinstance(wanted, Mapping) else wanted if isinstance(wanted, tuple) else (wanted,)
+            kinds = (
+                (dict,) if isinstance(expected, Mapping) else expected if isinstance(expected, tuple) else (expected,)
+            )
             if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
                 names = ", ".join(kind.__name__ for kind in kinds)
                 raise BadInput(self.path, f"{names} as the entry {self.key + name!r}", repr(value)[:80], REMEDY)
-            if isinstance(wanted, Mapping):
-                self[name].check(wanted)
+            if isinstance(expected, Mapping):
+                self[name].check(expected)
         return self
 
-    def check_given(self, shape: Mapping[str, Shape]) -> "Facts":
-        """As ``check``, of those entries alone that are there."""
-        return self.check({name: wanted for name, wanted in shape.items() if name in self})
+    def check_present(self, shape: Mapping[str, Shape]) -> "Facts":
+        """As ``check``, for the entries that are present."""
+        return self.check({name: expected for name, expected in shape.items() if name in self})
 
 
-def ask_digests_of(known: Callable[[Path], str | None]) -> None:
-    """Hold files against the MD5 that ``known`` gives for a path (None: not known) from now on, in this process."""
-    _known_by[:] = [known]
+def verify_with(digest_of: Callable[[Path], str | None]) -> None:
+    """From now on in this process, verify files by the MD5 that ``digest_of`` returns for a path (None: unknown)."""
+    _digest_sources[:] = [digest_of]
 
 
 def check_written(path: str | Path) -> None:
-    """Raise BadInput for a file whose bytes are known to be others than were written."""
-    for known in _known_by:
-        digest = known(Path(path))
+    """Raise BadInput for a file whose recorded MD5 differs."""
+    for digest_of in _digest_sources:
+        digest = digest_of(Path(path))
         if digest and digest != md5_file(path):
             raise BadInput(
                 path, "the bytes its stage wrote, by dvc.lock", "others", f"{REMEDY}; `dvc commit` accepts it"
@@ -79,33 +79,33 @@ def check_written(path: str | Path) -> None:
 
 
 def md5_file(path: str | Path) -> str:
-    """The MD5 by which DVC knows a file."""
+    """The MD5 that DVC records for a file."""
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "md5").hexdigest()
 
 
 def read_json(path: str | Path, shape: Mapping[str, Shape] | None = None) -> Facts:
-    """The JSON object in a file. Raises BadInput for anything else, and for entries that are not of ``shape``."""
+    """Read the JSON object in a file. Raises BadInput for anything else, and for entries that do not fit ``shape``."""
     values = _read(path, dict)
     return Facts(Path(path), values).check(shape or {})
 
 
 def read_json_rows(path: str | Path, shape: Mapping[str, Shape]) -> list[Facts]:
-    """The objects of a JSON list in a file. Raises BadInput as ``read_json`` does."""
-    rows = _read(path, list)
-    if not all(isinstance(row, dict) for row in rows):
-        raise BadInput(path, "a JSON list of objects", repr(rows)[:80], REMEDY)
-    return [Facts(Path(path), row, f"{number}.").check(shape) for number, row in enumerate(rows)]
+    """Read a JSON list of objects. Raises BadInput as ``read_json`` does."""
+    items = _read(path, list)
+    if not all(isinstance(item, dict) for item in items):
+        raise BadInput(path, "a JSON list of objects", repr(items)[:80], REMEDY)
+    return [Facts(Path(path), item, f"{number}.").check(shape) for number, item in enumerate(items)]
 
 
 def empty_reason(folder: str | Path) -> str | None:
-    """Why a stage's output folder is empty, or None when it holds something."""
+    """The reason why a stage's output folder is empty; None if it is not."""
     note = Path(folder) / EMPTY
     return str(read_json(note)["reason"]) if note.is_file() else None
 
 
 def require_output(folder: str | Path, stage: str, file: str = "info.json") -> None:
-    """Raise MissingResource with the reason where a stage wrote nothing else, and where ``file`` is not there."""
+    """Raise MissingResource if a stage's output is empty (with the reason) or ``file`` is missing."""
     if reason := empty_reason(folder):
         raise MissingResource(f"{folder} is empty: {reason}")
     if not (Path(folder) / file).exists():
@@ -125,7 +125,7 @@ def _read(path: str | Path, kind: type) -> Any:
 
 
 def read_table(path: str | Path, columns: Sequence[str] | None = None) -> "pd.DataFrame":
-    """The Parquet table in a file, or some of its columns. Raises BadInput for anything else."""
+    """Read a Parquet table, or some of its columns. Raises BadInput for anything else."""
     import pyarrow.parquet as pq
 
     try:

@@ -1,4 +1,4 @@
-"""Intervals of a recording in which something holds, and steps that stand out from the motion around them."""
+"""Intervals of frames with a property, and outlier steps of a motion."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -21,7 +21,7 @@ def runs(flags: np.ndarray) -> list[Interval]:
 
 
 def bridged(flags: np.ndarray, longest: int) -> np.ndarray:
-    """Flags (frame,) with gaps of at most ``longest`` frames between True ones filled."""
+    """Flags (frame,) with gaps of at most ``longest`` frames between True values filled."""
     filled = flags.copy()
     for start, stop in runs(~flags):
         if start > 0 and stop < len(flags) and stop - start <= longest:
@@ -30,7 +30,7 @@ def bridged(flags: np.ndarray, longest: int) -> np.ndarray:
 
 
 def widened(interval: Interval, margin: int, usable: np.ndarray) -> Interval:
-    """The interval with up to ``margin`` frames before and after it, as far as the frames are usable (frame,)."""
+    """The interval extended by up to ``margin`` frames on each side, while frames are usable (frame,)."""
     start, stop = interval
     while start > max(0, interval.start - margin) and usable[start - 1]:
         start -= 1
@@ -40,10 +40,16 @@ def widened(interval: Interval, margin: int, usable: np.ndarray) -> Interval:
 
 
 def sudden_steps(step: np.ndarray, notable: float, large: float, ratio: float, neighbours: int = 5) -> np.ndarray:
-    """(step,) booleans: steps above ``large``, or above ``notable`` and ``ratio`` times the motion around them.
+    """Find steps above ``large``, or above both ``notable`` and ``ratio`` times the motion around the step.
 
-    step: (step,) sizes >= 0 in any unit, that of ``notable`` and ``large``. The motion around a step is the median of
-    the ``2 * neighbours + 1`` steps about it, mirrored at the ends: it does not follow a glitch of one or two frames.
+    The motion around a step is the median of ``2 * neighbours + 1`` steps, mirrored at the ends. So a glitch of one or
+    two frames does not affect it.
+
+    Args:
+        step: (step,) sizes >= 0 in the unit of ``notable`` and ``large``.
+
+    Returns:
+        (step,) bool.
     """
     if not len(step):
         return np.zeros(0, dtype=bool)

@@ -1,8 +1,8 @@
 """Conversions between rotation representations, as pure functions.
 
-Every function takes NumPy arrays or torch tensors and gives back the same kind. Rotation matrices act on
-column vectors, ``x_world = R @ x_local``; axis-angles ("rotvec") are in radians; the last axes hold the rotation.
-Differentiable in torch, including at zero rotation.
+Functions of type ``Array`` take NumPy arrays or torch tensors and return the same type. Rotation matrices act on column
+vectors, ``x_world = R @ x_local``. Axis-angles ("rotvec") are in radians. The last axes are the rotation. In torch,
+they are differentiable, also at zero rotation.
 """
 
 from typing import TypeVar
@@ -29,7 +29,7 @@ def _rotvec_to_rotmat_torch(rotvec: torch.Tensor) -> torch.Tensor:
     small = square < 1e-12
     safe = torch.where(small, torch.ones_like(square), square)
     angle = safe.sqrt()
-    # Taylor series below 1e-6 rad keeps the gradient finite where angle has none.
+    # A Taylor series below 1e-6 rad keeps the gradient finite, where that of the angle is not defined.
     sine = torch.where(small, 1 - square / 6, torch.sin(angle) / angle)[..., None]
     versine = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / safe)[..., None]
     cross = skew(rotvec)
@@ -58,25 +58,25 @@ def rotmat_to_rotvec(rotmat: Array) -> Array:
 
 
 def canonical_rotvec(rotvec: np.ndarray) -> np.ndarray:
-    """The same rotations as axis-angles (..., 3) of at most pi; vectors that are no longer than pi stay bit for bit."""
-    beyond = np.linalg.norm(np.asarray(rotvec, dtype=np.float64), axis=-1) > np.pi
-    if not beyond.any():
+    """The same rotations as axis-angles (..., 3) of at most pi; vectors of at most pi keep their bits."""
+    is_large = np.linalg.norm(np.asarray(rotvec, dtype=np.float64), axis=-1) > np.pi
+    if not is_large.any():
         return rotvec
     canonical = rotvec.copy()
-    canonical[beyond] = rotmat_to_rotvec(rotvec_to_rotmat(np.asarray(rotvec[beyond], dtype=np.float64)))
+    canonical[is_large] = rotmat_to_rotvec(rotvec_to_rotmat(np.asarray(rotvec[is_large], dtype=np.float64)))
     return canonical
 
 
 def nearest_rotvec(rotvec: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Axis-angles (..., 3) of the same rotations as ``rotvec``, less or more one full turn if nearer to ``reference``.
+    """The same rotations as ``rotvec`` (..., 3), with one full turn added or removed to be closest to ``reference``.
 
-    Differences of axis-angles mean something only between such numbers: 179 and -179 degrees are 2 degrees apart.
+    Only then are differences of axis-angles meaningful: 179 and -179 degrees are 2 degrees apart.
     """
     angle = np.linalg.norm(rotvec, axis=-1, keepdims=True)
-    turn = 2 * np.pi * np.divide(rotvec, angle, out=np.zeros_like(rotvec), where=angle > 0)
-    each = np.stack([rotvec, rotvec - turn, rotvec + turn])
-    nearest = np.linalg.norm(each - reference, axis=-1).argmin(axis=0)
-    return np.take_along_axis(each, nearest[None, ..., None], axis=0)[0]
+    full_turn = 2 * np.pi * np.divide(rotvec, angle, out=np.zeros_like(rotvec), where=angle > 0)
+    candidates = np.stack([rotvec, rotvec - full_turn, rotvec + full_turn])
+    nearest = np.linalg.norm(candidates - reference, axis=-1).argmin(axis=0)
+    return np.take_along_axis(candidates, nearest[None, ..., None], axis=0)[0]
 
 
 def rotation_angle(rotmat: np.ndarray) -> np.ndarray:
@@ -95,7 +95,7 @@ def rotmat_to_rot6d(rotmat: Array) -> Array:
 def rot6d_to_rotmat(rot6d: Array) -> Array:
     """6D form ``(..., 6)`` to rotation matrices ``(..., 3, 3)`` by Gram-Schmidt (Zhou et al. 2019, eq. 15).
 
-    Takes any numbers, also network output, as long as the two columns are not parallel.
+    The input may be any network output whose two columns are not parallel.
     """
     if isinstance(rot6d, np.ndarray):
         return rot6d_to_rotmat(torch.from_numpy(np.ascontiguousarray(rot6d))).numpy()
@@ -107,12 +107,12 @@ def rot6d_to_rotmat(rot6d: Array) -> Array:
 
 
 def turns_about(rotmat: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """(frame - 1,) radians by which rotations (frame, 3, 3) turn about a unit axis (3,) from each frame to the next."""
+    """(frame - 1,) angles in radians about a unit axis (3,) between successive rotations (frame, 3, 3)."""
     return rotmat_to_rotvec(rotmat[1:] @ rotmat[:-1].swapaxes(1, 2)) @ axis
 
 
 def mirror_rotvec_x(rotvec: Array) -> Array:
-    """The axis-angle ``(..., 3)`` seen in a mirror with normal x: ``diag(-1,1,1) R diag(-1,1,1)``."""
+    """Mirror axis-angles ``(..., 3)`` at the plane with normal x: ``diag(-1,1,1) R diag(-1,1,1)``."""
     if isinstance(rotvec, torch.Tensor):
         return rotvec * rotvec.new_tensor((1.0, -1.0, -1.0))
     return rotvec * np.asarray((1.0, -1.0, -1.0), dtype=rotvec.dtype)

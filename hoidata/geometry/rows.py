@@ -1,4 +1,4 @@
-"""Rows of numbers that are equal, as vertices of a mesh that lie in one place."""
+"""Finds equal rows of an array, such as coinciding vertices of a mesh."""
 
 from typing import NamedTuple
 
@@ -7,23 +7,19 @@ import pandas as pd
 
 
 class DistinctRows(NamedTuple):
-    """first: (distinct,) where each distinct row stands first, in the order of the rows' values (first column first).
+    """The distinct rows of an array, sorted by value."""
 
-    number: (row,) which of these a row is equal to.
-    """
-
-    first: np.ndarray
-    number: np.ndarray
+    first: np.ndarray  # (distinct,) index of the first occurrence of each distinct row
+    number: np.ndarray  # (row,) index of each row's distinct row
 
 
 def distinct_rows(rows: np.ndarray) -> DistinctRows:
-    """Which rows (row, column) are equal; NaN counts as equal to NaN.
+    """Find the distinct rows of an array (row, column); NaN equals NaN.
 
-    What ``np.unique(rows, axis=0)`` finds, several times faster where rows repeat, as corners of triangles do: pandas
-    numbers column by column, NumPy compares whole rows.
+    The result is that of ``np.unique(rows, axis=0)``, several times faster for repeated rows such as triangle corners.
     """
     table = pd.DataFrame(np.asarray(rows))
     number = table.groupby(list(table.columns), sort=True, dropna=False).ngroup().to_numpy(np.int64)
     first = np.full(number.max(initial=-1) + 1, -1, np.int64)
-    first[number[::-1]] = np.arange(len(number))[::-1]  # of equal ones the last that is set stays: the first row
+    first[number[::-1]] = np.arange(len(number))[::-1]  # the last assignment wins, so assign in reverse order
     return DistinctRows(first, number)

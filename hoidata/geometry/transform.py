@@ -1,9 +1,9 @@
-"""Rigid transforms that name their frames, so that a chain reads by eye.
+"""Rigid transforms whose names state their frames.
 
     points_world = world_from_object @ object_from_part @ points_part
     points_object = world_from_object.inverse() @ points_world
 
-Works on NumPy arrays and torch tensors alike; rotations act on column vectors, ``x_world = R @ x_object``.
+The arrays are NumPy arrays or torch tensors. Rotations act on column vectors, ``x_world = R @ x_object``.
 """
 
 from dataclasses import dataclass
@@ -16,30 +16,28 @@ from hoidata.geometry.rotations import Array, rotvec_to_rotmat
 
 @dataclass(frozen=True, eq=False)
 class RigidTransform:
-    """``a_from_b``: takes points of frame b to frame a, ``rotation (p - pivot) + offset``.
+    """``a_from_b``: maps points of frame b to frame a by ``rotation (p - pivot) + offset``.
 
-    rotation: (..., 3, 3). offset: (..., 3) where the pivot goes, metres in frame a; None for zero.
-    pivot: (..., 3) the point turned about, metres in frame b; None for the origin. The inverse exchanges the two, so
-    that turning about a hinge, and undoing a pose, round exactly as these words say: stored bytes depend on it.
+    The inverse exchanges pivot and offset. Stored bytes depend on the rounding of exactly this formula.
     """
 
-    rotation: Any
-    offset: Any = None
-    pivot: Any = None
+    rotation: Any  # (..., 3, 3)
+    offset: Any = None  # (..., 3) position of the pivot in frame a, metres; None for zero
+    pivot: Any = None  # (..., 3) centre of the rotation in frame b, metres; None for the origin
 
     @classmethod
     def from_rotvec(cls, rotvec: Array, translation_m: Array) -> "RigidTransform":
-        """From axis-angles (..., 3), radians, and positions (..., 3) of the origin of b in a, metres."""
+        """Build from axis-angles (..., 3) in radians and positions (..., 3) of the origin of b in a, metres."""
         return cls(rotvec_to_rotmat(rotvec), translation_m)
 
     @property
     def translation(self) -> Any:
-        """(..., 3) where the origin of b lies in a, metres."""
+        """(..., 3) position of the origin of b in a, metres."""
         offset = self.rotation[..., 0] * 0 if self.offset is None else self.offset
         return offset if self.pivot is None else offset - _turned(self.rotation, self.pivot)
 
     def inverse(self) -> "RigidTransform":
-        """``b_from_a``."""
+        """The transform ``b_from_a``."""
         return self if self is IDENTITY else RigidTransform(self.rotation.swapaxes(-1, -2), self.pivot, self.offset)
 
     @overload
@@ -47,7 +45,7 @@ class RigidTransform:
     @overload
     def __matmul__(self, other: Array) -> Array: ...
     def __matmul__(self, other):
-        """``a_from_b @ b_from_c``, or points (..., point, 3) of b in a. Leading axes broadcast: (frame, point, 3)."""
+        """Compose ``a_from_b @ b_from_c``, or map points (..., point, 3) of b to a. Leading axes broadcast."""
         if self is IDENTITY or other is IDENTITY:
             return other if self is IDENTITY else self
         if isinstance(other, RigidTransform):
@@ -59,16 +57,17 @@ class RigidTransform:
         return points if self.offset is None else points + self.offset[..., None, :]
 
     def turn(self, vectors: Array) -> Array:
-        """Directions (..., vector, 3) of b in a: turned, not moved."""
+        """Rotate directions (..., vector, 3) of b to a."""
         return vectors if self is IDENTITY else vectors @ self.rotation.swapaxes(-1, -2)
 
-    def __getitem__(self, rows: Any) -> "RigidTransform":
-        """Some rows of the leading axis; a pivot or offset that all rows share stays."""
-        shared = self.rotation.ndim - 2
+    def __getitem__(self, index: Any) -> "RigidTransform":
+        """Index the leading axis; a pivot or offset without that axis is shared."""
+        ndim_of_shared = self.rotation.ndim - 2
         offset, pivot = (
-            value if value is None or value.ndim <= shared else value[rows] for value in (self.offset, self.pivot)
+            value if value is None or value.ndim <= ndim_of_shared else value[index]
+            for value in (self.offset, self.pivot)
         )
-        return RigidTransform(self.rotation[rows], offset, pivot)
+        return RigidTransform(self.rotation[index], offset, pivot)
 
 
 IDENTITY = RigidTransform(np.eye(3))
@@ -79,5 +78,5 @@ def _turned(rotation: Any, vector: Any) -> Any:
 
 
 def _sum(first: Any, second: Any) -> Any:
-    """Of two vectors of which None stands for zero."""
+    """The sum of two vectors, either of which may be None for zero."""
     return second if first is None else first if second is None else first + second

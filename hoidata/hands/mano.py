@@ -70,7 +70,7 @@ def load_mano_hands(folder: str | Path) -> HandPair:
 def _load_side(folder: Path, side: Side) -> HandModel:
     path = _find(folder, FILE_NAMES[side])
     with open(path, "rb") as stream:
-        content = restricted_load(stream, _ALLOW, encoding="latin1", where=path, max_bytes=_MAX_BYTES)
+        content = restricted_load(stream, _ALLOW, encoding="latin1", path=path, max_bytes=_MAX_BYTES)
     if not isinstance(content, dict):
         raise BadInput(path, "a dict of arrays", type(content).__name__, _REMEDY)
     model = checked_model(str(path), _REMEDY, side=side, name="mano", **_fields(path, content))

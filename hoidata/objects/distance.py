@@ -1,6 +1,6 @@
-"""Nearest points of a triangle mesh by libigl, and what a mesh is made of: merged vertices, edges, normals, volume.
+"""Closest points on a triangle mesh (libigl), and mesh properties: merged vertices, edges, normals, volume.
 
-Signed distances are ``hoidata.objects.surface_index``'s.
+``hoidata.objects.surface_index`` computes signed distances.
 """
 
 from typing import NamedTuple
@@ -15,31 +15,37 @@ CHUNK_POINTS = 1 << 17
 
 
 class ClosestPoints(NamedTuple):
-    """distance_m: (point,) >= 0; closest_m: (point, 3) on the surface."""
+    """The closest surface point of each query point."""
 
-    distance_m: np.ndarray
-    closest_m: np.ndarray
+    distance_m: np.ndarray  # (point,) >= 0
+    closest_m: np.ndarray  # (point, 3) on the surface
 
 
 class SignedDistance(NamedTuple):
-    """distance_m: (point,) negative inside; closest_m: (point, 3); normal: (point, 3) the distance's gradient."""
+    """Signed distance and closest surface point of each query point."""
 
-    distance_m: np.ndarray
-    closest_m: np.ndarray
-    normal: np.ndarray
+    distance_m: np.ndarray  # (point,) negative inside
+    closest_m: np.ndarray  # (point, 3) on the surface
+    normal: np.ndarray  # (point, 3) unit gradient of the signed distance, outward
 
 
 class MergedSurface(NamedTuple):
-    """Vertices merged, collapsed triangles left out. vertices_m: (vertex, 3) float64; faces: (face, 3) int64."""
+    """A mesh whose coinciding vertices are merged, without triangles that collapse."""
 
-    vertices_m: np.ndarray
-    faces: np.ndarray
+    vertices_m: np.ndarray  # (vertex, 3) float64
+    faces: np.ndarray  # (face, 3) int64
 
 
 def closest_points(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndarray) -> ClosestPoints:
-    """Nearest point of the mesh ``(vertex, 3)``, ``(face, 3)`` to each of ``points_m (point, 3)``; metres, one frame.
+    """Closest point of a mesh to each query point.
 
-    Raises BadInput for a mesh without triangles of positive area or with numbers that are not finite.
+    Args:
+        vertices_m: (vertex, 3), any frame.
+        faces: (face, 3).
+        points_m: (point, 3), same frame.
+
+    Raises:
+        BadInput: the mesh has no triangle of positive area, or a vertex is not finite.
     """
     surface = merged_surface(vertices_m, faces)
     parts = [igl.point_mesh_squared_distance(chunk, *surface)[::2] for chunk in _chunks(points_m)]
@@ -56,33 +62,33 @@ def face_normals(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def merged_surface(vertices_m: np.ndarray, faces: np.ndarray) -> MergedSurface:
-    """Vertices that coincide taken as one. Raises BadInput as :func:`closest_points` does."""
+    """Merge coinciding vertices. Raises BadInput as :func:`closest_points` does."""
     vertices = np.ascontiguousarray(vertices_m, dtype=np.float64)
     if not np.isfinite(vertices).all():
         raise BadInput("object mesh", "finite vertices", "NaN or infinity", "repair the mesh")
     first, number = distinct_rows(vertices)
     merged = number[np.asarray(faces, dtype=np.int64)].reshape(-1, 3)
     a, b, c = merged.T
-    kept = merged[(a != b) & (b != c) & (c != a)]
-    if not len(kept):
+    valid_faces = merged[(a != b) & (b != c) & (c != a)]
+    if not len(valid_faces):
         raise BadInput(
             "object mesh", "at least one triangle", f"{len(merged)} faces, none with area", "repair the mesh"
         )
-    return MergedSurface(vertices[first], kept)
+    return MergedSurface(vertices[first], valid_faces)
 
 
 def unmatched_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Directed edges (edge, 2) of the triangles (face, 3), and how often each is there more than its opposite."""
+    """Directed edges (edge, 2) of triangles (face, 3), and each edge's count minus the count of its opposite."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     size = int(faces.max()) + 1
     keys = np.concatenate([edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]])
-    found, number = np.unique(keys, return_inverse=True)
-    unmatched = np.bincount(number, np.repeat([1, -1], len(edges)), len(found))
-    return np.stack(np.divmod(found, size), axis=1), unmatched
+    pairs, pair_of_edge = np.unique(keys, return_inverse=True)
+    unmatched = np.bincount(pair_of_edge, np.repeat([1, -1], len(edges)), len(pairs))
+    return np.stack(np.divmod(pairs, size), axis=1), unmatched
 
 
 def is_closed(faces: np.ndarray) -> bool:
-    """Every directed edge is met by its opposite exactly as often: a closed, consistently oriented surface."""
+    """Whether each directed edge occurs as often as its opposite: a closed, consistently oriented surface."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     size = int(faces.max()) + 1
     forward = np.sort(edges[:, 0] * size + edges[:, 1])
@@ -91,7 +97,7 @@ def is_closed(faces: np.ndarray) -> bool:
 
 
 def volume_m3(vertices_m: np.ndarray, faces: np.ndarray) -> float:
-    """Volume a closed surface encloses by the divergence theorem; negative when it is turned inside out."""
+    """Volume of a closed surface by the divergence theorem; negative if its triangles face inward."""
     corners = (vertices_m - vertices_m.mean(axis=0))[faces]
     return float(np.einsum("fx,fx->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
 

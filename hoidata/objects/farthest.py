@@ -1,4 +1,4 @@
-"""Farthest-point sampling with points in buckets: a bucket is read again only where the newest choice can matter.
+"""Farthest-point sampling with points in buckets: only buckets that the newest choice can affect are visited.
 
 Compiled with numba. Squared distances in float32 in one fixed order, so that every point keeps the bits a plain loop
 gives it (Eldar et al. 1997; buckets as in Han et al. 2023, "QuickFPS").
@@ -8,24 +8,24 @@ import numpy as np
 from numba import njit
 
 _POINTS_PER_BUCKET = 128
-_ROUNDING = np.float32(1 - 1e-5)  # a bound from box corners is rounded otherwise than a distance
+_ROUNDING = np.float32(1 - 1e-5)  # a bound from box corners rounds differently from a distance
 
 
 def farthest_points(points_m: np.ndarray, count: int) -> np.ndarray:
-    """(count,) rows of ``points_m (point, 3)``: the first, then always the point farthest from all chosen so far.
+    """(count,) indices of points (point, 3): the first point, then each time the one farthest from all chosen ones.
 
-    Squared distances in float32; among equals the lowest row. Rows repeat only when points coincide.
+    Squared distances are float32, and the lowest index wins a tie. Indices repeat only when points coincide.
     """
     points = np.ascontiguousarray(points_m, dtype=np.float32)
     order, first = _buckets(points)
     x, y, z = np.ascontiguousarray(points[order].T, np.float32)
     low = np.minimum.reduceat(points[order], first[:-1], axis=0)
     high = np.maximum.reduceat(points[order], first[:-1], axis=0)
-    return _choose(x, y, z, order, first, low, high, points, count)
+    return _choose_points(x, y, z, order, first, low, high, points, count)
 
 
 def _buckets(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows bucket by bucket, rising in each, and where each starts: intervals of a Morton curve through the points."""
+    """Point indices in buckets (intervals of a Morton curve), rising in each bucket, and the start of each bucket."""
     above = points.astype(np.float64) - points.min(axis=0)
     cell = (above / (above.max() or 1) * 1023).astype(np.uint32)
     x, y, z = _spread_bits(cell).T
@@ -44,22 +44,23 @@ def _spread_bits(value: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def _choose(x, y, z, order, first, low, high, points, count):  # pragma: no cover (compiled)
+def _choose_points(x, y, z, order, first, low, high, points, count):  # pragma: no cover (compiled)
     nearest = np.full(len(x), np.float32(np.inf), np.float32)
-    farthest = np.full(len(low), np.float32(np.inf), np.float32)  # of each bucket: its largest distance
-    winner = np.zeros(len(low), np.int64)  # and the lowest row that has it
+    farthest = np.full(len(low), np.float32(np.inf), np.float32)  # (bucket,) its largest distance
+    winner = np.zeros(len(low), np.int64)  # (bucket,) the lowest index of a point at that distance
     chosen = np.zeros(count, np.int64)
     for step in range(1, count):
         last = points[chosen[step - 1]]
-        best, best_row = np.float32(-1), 0
+        best, best_point = np.float32(-1), 0
+        # A bucket changes only if the last choice is closer to its box than its farthest point is to the chosen ones.
         for bucket in range(len(low)):
             if _square_to_box(last, low[bucket], high[bucket]) * _ROUNDING < farthest[bucket]:
                 start, stop = first[bucket], first[bucket + 1]
-                row = start + _lower(x[start:stop], y[start:stop], z[start:stop], last, nearest[start:stop])
-                farthest[bucket], winner[bucket] = nearest[row], order[row]
-            if farthest[bucket] > best or (farthest[bucket] == best and winner[bucket] < best_row):
-                best, best_row = farthest[bucket], winner[bucket]
-        chosen[step] = best_row
+                point = start + _lower_distances(x[start:stop], y[start:stop], z[start:stop], last, nearest[start:stop])
+                farthest[bucket], winner[bucket] = nearest[point], order[point]
+            if farthest[bucket] > best or (farthest[bucket] == best and winner[bucket] < best_point):
+                best, best_point = farthest[bucket], winner[bucket]
+        chosen[step] = best_point
     return chosen
 
 
@@ -74,17 +75,17 @@ def _square_to_box(point, low, high):  # pragma: no cover (compiled)
 
 
 @njit(cache=True)
-def _lower(x, y, z, point, nearest):  # pragma: no cover (compiled)
-    """Lower each distance to that from ``point`` where it is smaller; where the largest is, the first of equals."""
-    for row in range(len(x)):
-        dx, dy, dz = x[row] - point[0], y[row] - point[1], z[row] - point[2]
+def _lower_distances(x, y, z, reference, nearest):  # pragma: no cover (compiled)
+    """Lower each distance to that from ``reference`` if smaller. Returns the first index of the largest distance."""
+    for point in range(len(x)):
+        dx, dy, dz = x[point] - reference[0], y[point] - reference[1], z[point] - reference[2]
         square = (dx * dx + dy * dy) + dz * dz
-        nearest[row] = min(nearest[row], square)
-    # Bits of floats that are not negative are in the order of their values, and a largest integer is found on vectors.
+        nearest[point] = min(nearest[point], square)
+    # Non-negative floats sort like their bits, and the compiler vectorizes the maximum of integers.
     bits, largest = nearest.view(np.int32), np.int32(-1)
-    for row in range(len(bits)):
-        largest = max(largest, bits[row])
-    for row in range(len(bits)):
-        if bits[row] == largest:
-            return row
+    for point in range(len(bits)):
+        largest = max(largest, bits[point])
+    for point in range(len(bits)):
+        if bits[point] == largest:
+            return point
     return 0

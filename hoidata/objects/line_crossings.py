@@ -1,8 +1,8 @@
-"""Lines along the x axis through closed surfaces: what is inside, and where a line runs inside.
+"""Intersections of lines along x with closed surfaces: inside tests, and the intervals of a line inside a solid.
 
-Compiled with numba, float64, one thread. All that call each other stand in this file: numba keeps compiled code by the
-file it is in, and does not see a change in another. Inside is what the surface winds around: where a line through the
-position leaves the surface behind it oftener than it enters.
+Compiled with numba, float64, one thread. Functions that call each other are in one file, because numba's cache is
+invalidated only by a change of the file itself. A point is inside if its winding number is positive: the line beyond
+the point leaves the surface more often than it enters.
 """
 
 from typing import NamedTuple
@@ -16,72 +16,70 @@ OUTSIDE, INSIDE, UNSURE = 0, 1, 2
 
 
 class Intervals(NamedTuple):
-    """Lines through a solid, one in the middle of each cell of a lattice in y and z.
+    """Intervals inside a solid, of lines along x through the cell centres of a lattice in y and z."""
 
-    low_m: (2,) y and z of the lattice's corner; cell_m: edge of a cell; shape: (2,) cells. first: (line + 1,) where
-    each line's intervals inside the solid start; start_m, stop_m: (interval,) x of their ends, rising along a line.
-    """
-
-    low_m: np.ndarray
-    cell_m: float
-    shape: np.ndarray
-    first: np.ndarray
-    start_m: np.ndarray
-    stop_m: np.ndarray
+    low_m: np.ndarray  # (2,) y and z of the lattice's corner
+    cell_m: float  # edge of a cell
+    shape: np.ndarray  # (2,) cells along y and z
+    first: np.ndarray  # (line + 1,) index of each line's first interval
+    start_m: np.ndarray  # (interval,) x of the start, rising along a line
+    stop_m: np.ndarray  # (interval,) x of the end
 
 
 def intervals_inside(tree: TriangleTree, cell_m: float) -> Intervals:
-    """The intervals of the lines of a lattice that lie inside a closed surface.
+    """Intersect a lattice of lines, centred on the bounding box, with the solid that a closed surface bounds.
 
-    tree: its triangles, metres. cell_m: distance of the lines; they lie evenly about the middle of the surface's box.
+    Args:
+        tree: the surface's triangles.
+        cell_m: distance between lines.
     """
     low, high = tree.box[0, 1:3], tree.box[0, 4:]
-    shape = np.ceil((high - low) / cell_m - 1e-9).astype(np.int64)  # a size that is so many cells but for rounding
+    shape = np.ceil((high - low) / cell_m - 1e-9).astype(np.int64)  # rounding must not add a cell
     corner = (low + high) / 2 - shape * cell_m / 2
     return Intervals(corner, cell_m, shape, *_intervals(tree, corner, cell_m, shape))
 
 
 @njit(cache=True)
-def settle_sides(tree, positions_m, side):  # pragma: no cover (compiled)
-    """Where ``side (position,)`` is UNSURE, set it to INSIDE or OUTSIDE for ``positions_m (position, 3)``."""
+def settle_sides(tree, points_m, side):  # pragma: no cover (compiled)
+    """Replace UNSURE in ``side (point,)`` by INSIDE or OUTSIDE for ``points_m (point, 3)``."""
     _, box, link, _, corner, vertices_m, _ = tree
-    stack, crossed, turns = np.empty(DEEPEST, np.int64), np.empty(len(corner)), np.empty(len(corner))
-    for row in range(len(positions_m)):
-        if side[row] == UNSURE:
-            x, y, z = positions_m[row, 0], positions_m[row, 1], positions_m[row, 2]
-            count = _crossings(box, link, corner, vertices_m, y, z, stack, crossed, turns)
-            side[row] = INSIDE if _winding(crossed, turns, count, x) > 0 else OUTSIDE
+    stack, crossings_m, signs = np.empty(DEEPEST, np.int64), np.empty(len(corner)), np.empty(len(corner))
+    for point in range(len(points_m)):
+        if side[point] == UNSURE:
+            x, y, z = points_m[point, 0], points_m[point, 1], points_m[point, 2]
+            count = _crossings(box, link, corner, vertices_m, y, z, stack, crossings_m, signs)
+            side[point] = INSIDE if _winding(crossings_m, signs, count, x) > 0 else OUTSIDE
 
 
 @njit(cache=True)
-def turn_inside_negative(tree, low_m, cell_m, value):  # pragma: no cover (compiled)
-    """Of a grid's nodes ``value (z, y, x)`` those inside."""
+def negate_inside(tree, low_m, cell_m, value):  # pragma: no cover (compiled)
+    """Change the sign of a grid's values (z, y, x) at nodes inside the surface."""
     _, box, link, _, corner, vertices_m, _ = tree
-    stack, crossed, turns = np.empty(DEEPEST, np.int64), np.empty(len(corner)), np.empty(len(corner))
+    stack, crossings_m, signs = np.empty(DEEPEST, np.int64), np.empty(len(corner)), np.empty(len(corner))
     for k in range(value.shape[0]):
         for j in range(value.shape[1]):
             y, z = low_m[1] + j * cell_m, low_m[2] + k * cell_m
-            count = _crossings(box, link, corner, vertices_m, y, z, stack, crossed, turns)
+            count = _crossings(box, link, corner, vertices_m, y, z, stack, crossings_m, signs)
             for i in range(value.shape[2]):
-                if _winding(crossed, turns, count, low_m[0] + i * cell_m) > 0:
+                if _winding(crossings_m, signs, count, low_m[0] + i * cell_m) > 0:
                     value[k, j, i] = -value[k, j, i]
 
 
 @njit(cache=True, inline="always")
-def _winding(crossed, turns, count, x):  # pragma: no cover (compiled)
+def _winding(crossings_m, signs, count, x):  # pragma: no cover (compiled)
     winding = 0.0
     for number in range(count):
-        winding += turns[number] * (crossed[number] > x)
+        winding += signs[number] * (crossings_m[number] > x)
     return winding
 
 
 @njit(cache=True)
-def _crossings(box, link, corner, vertices_m, y, z, stack, positions, turns):  # pragma: no cover (compiled)
-    """Where the line along x through (y, z) crosses the triangles: how many times.
+def _crossings(box, link, corner, vertices_m, y, z, stack, crossings_m, signs):  # pragma: no cover (compiled)
+    """Intersect the line along x through (y, z) with the triangles. Returns the number of crossings.
 
-    positions: x of each crossing. turns: +1 where the outward normal points to +x (the line leaves the solid), -1 where
-    it enters. A line through an edge or a corner counts as moved by nothing to +y, then by less to +z, so that a closed
-    surface is left as often as it is entered.
+    ``crossings_m`` receives the x of each crossing, ``signs`` +1 if the line leaves the solid there (outward normal
+    along +x) and -1 if it enters. A line through an edge or a corner counts as shifted by an infinitesimal step to +y
+    and a smaller one to +z, so that every line leaves a closed surface as often as it enters.
     """
     count, size = 0, 1
     stack[0] = 0
@@ -96,85 +94,84 @@ def _crossings(box, link, corner, vertices_m, y, z, stack, positions, turns):  #
             size += 2
             continue
         for number in range(link[node, 1], link[node, 2]):
-            turn, position = _crossing(vertices_m, corner[number, 0], corner[number, 1], corner[number, 2], y, z)
-            if turn != 0:
-                positions[count], turns[count] = position, turn
+            sign, x_m = _crossing(vertices_m, corner[number, 0], corner[number, 1], corner[number, 2], y, z)
+            if sign != 0:
+                crossings_m[count], signs[count] = x_m, sign
                 count += 1
     return count
 
 
 @njit(cache=True)
 def _crossing(vertices_m, a, b, c, y, z):  # pragma: no cover (compiled)
-    """The turn with which the line along x through (y, z) crosses a triangle, 0 where it misses, and the position.
-
-    See ``_crossings``.
-    """
-    turn_a, area_a = _side_of_edge(vertices_m, b, c, y, z)
-    turn_b, area_b = _side_of_edge(vertices_m, c, a, y, z)
-    turn_c, area_c = _side_of_edge(vertices_m, a, b, y, z)
+    """Sign (0 for a miss) and x of the crossing of one triangle by the line along x through (y, z)."""
+    sign_a, area_a = _side_of_edge(vertices_m, b, c, y, z)
+    sign_b, area_b = _side_of_edge(vertices_m, c, a, y, z)
+    sign_c, area_c = _side_of_edge(vertices_m, a, b, y, z)
+    # The line hits the triangle if it is on the same side of all edges; the areas are its barycentric coordinates.
     area = area_a + area_b + area_c
-    if turn_a != turn_b or turn_b != turn_c or area == 0:
+    if sign_a != sign_b or sign_b != sign_c or area == 0:
         return 0.0, 0.0
     x = area_a * vertices_m[a, 0] + area_b * vertices_m[b, 0] + area_c * vertices_m[c, 0]
-    return turn_a, x / area
+    return sign_a, x / area
 
 
 @njit(cache=True, inline="always")
-def _side_of_edge(vertices_m, start, stop, y, z):  # pragma: no cover (compiled)
-    """On which side of an edge, seen along x, the line runs (+1 left), and twice the area between.
+def _side_of_edge(vertices_m, start, end, y, z):  # pragma: no cover (compiled)
+    """Side of an edge, seen along x, on which the line is (+1 left), and twice the signed area between them.
 
-    Both triangles of an edge compute the same number: from the corner that is numbered lower.
+    Both triangles of an edge compute the same bits, because both start from the corner with the lower index.
     """
-    low, high = min(start, stop), max(start, stop)
-    way_y, way_z = vertices_m[high, 1] - vertices_m[low, 1], vertices_m[high, 2] - vertices_m[low, 2]
-    area = way_y * (z - vertices_m[low, 2]) - way_z * (y - vertices_m[low, 1])
-    turn = np.sign(area)
-    if turn == 0:
-        turn = -np.sign(way_z)
-    if turn == 0:
-        turn = np.sign(way_y)
-    return (turn, area) if start == low else (-turn, -area)
+    low, high = min(start, end), max(start, end)
+    edge_y, edge_z = vertices_m[high, 1] - vertices_m[low, 1], vertices_m[high, 2] - vertices_m[low, 2]
+    area = edge_y * (z - vertices_m[low, 2]) - edge_z * (y - vertices_m[low, 1])
+    sign = np.sign(area)
+    # A line through the edge: the sign after the infinitesimal shift to +y, then to +z.
+    if sign == 0:
+        sign = -np.sign(edge_z)
+    if sign == 0:
+        sign = np.sign(edge_y)
+    return (sign, area) if start == low else (-sign, -area)
 
 
 @njit(cache=True)
 def _intervals(tree, low_m, cell_m, shape):  # pragma: no cover (compiled)
-    """Where each line runs inside the solid."""
+    """Index of each line's first interval, and start and end of the intervals inside the solid."""
     _, box, link, _, corner, vertices_m, _ = tree
-    stack, positions, turns = np.empty(DEEPEST, np.int64), np.empty(len(corner)), np.empty(len(corner))
+    stack, crossings_m, signs = np.empty(DEEPEST, np.int64), np.empty(len(corner)), np.empty(len(corner))
     first = np.zeros(shape[0] * shape[1] + 1, np.int64)
     start, stop = [0.0 for _ in range(0)], [0.0 for _ in range(0)]
     for j in range(shape[0]):
         for k in range(shape[1]):
             y, z = low_m[0] + (j + 0.5) * cell_m, low_m[1] + (k + 0.5) * cell_m
-            count = _crossings(box, link, corner, vertices_m, y, z, stack, positions, turns)
-            _sort(positions, turns, count)
+            count = _crossings(box, link, corner, vertices_m, y, z, stack, crossings_m, signs)
+            _sort(crossings_m, signs, count)
             winding = 0.0
             for number in range(count):
                 if winding > 0:
-                    start.append(positions[number - 1])
-                    stop.append(positions[number])
-                winding -= turns[number]
+                    start.append(crossings_m[number - 1])
+                    stop.append(crossings_m[number])
+                winding -= signs[number]
             first[j * shape[1] + k + 1] = len(start)
     return first, np.array(start), np.array(stop)
 
 
 @njit(cache=True)
-def _sort(positions, turns, count):  # pragma: no cover (compiled)
-    """By position; a line has a handful of crossings."""
+def _sort(crossings_m, signs, count):  # pragma: no cover (compiled)
+    """Sort by insertion, because a line has few crossings."""
     for number in range(1, count):
-        position, turn, at = positions[number], turns[number], number
-        while at and positions[at - 1] > position:
-            positions[at], turns[at] = positions[at - 1], turns[at - 1]
-            at -= 1
-        positions[at], turns[at] = position, turn
+        crossing_m, sign, slot = crossings_m[number], signs[number], number
+        while slot and crossings_m[slot - 1] > crossing_m:
+            crossings_m[slot], signs[slot] = crossings_m[slot - 1], signs[slot - 1]
+            slot -= 1
+        crossings_m[slot], signs[slot] = crossing_m, sign
 
 
 @njit(cache=True)
 def common_length_m(vertices_m, faces, intervals):  # pragma: no cover (compiled)
-    """Summed over all lines, the length inside both a closed surface (vertex, 3), (face, 3) and the intervals."""
+    """Total length of lines inside both a closed surface (vertex, 3), (face, 3) and the intervals."""
     low_m, cell_m, shape, first, start_m, stop_m = intervals
-    newest = np.full(shape[0] * shape[1], -1, np.int64)  # of each line, its newest crossing
-    older, positions, turns = [0 for _ in range(0)], [0.0 for _ in range(0)], [0.0 for _ in range(0)]
+    newest = np.full(shape[0] * shape[1], -1, np.int64)  # (line,) index of its last crossing: a linked list
+    previous, crossings_m, signs = [0 for _ in range(0)], [0.0 for _ in range(0)], [0.0 for _ in range(0)]
     for face in range(len(faces)):
         a, b, c = faces[face]
         j_start, j_stop = _cells_between(vertices_m, a, b, c, 1, low_m[0], cell_m, shape[0])
@@ -185,41 +182,41 @@ def common_length_m(vertices_m, faces, intervals):  # pragma: no cover (compiled
                 if first[line] == first[line + 1]:
                     continue
                 y, z = low_m[0] + (j + 0.5) * cell_m, low_m[1] + (k + 0.5) * cell_m
-                turn, position = _crossing(vertices_m, a, b, c, y, z)
-                if turn != 0:
-                    older.append(int(newest[line]))
-                    newest[line] = len(positions)
-                    positions.append(position)
-                    turns.append(turn)
-    return _summed(newest, older, positions, turns, first, start_m, stop_m)
+                sign, crossing_m = _crossing(vertices_m, a, b, c, y, z)
+                if sign != 0:
+                    previous.append(int(newest[line]))
+                    newest[line] = len(crossings_m)
+                    crossings_m.append(crossing_m)
+                    signs.append(sign)
+    return _sum_common_lengths(newest, previous, crossings_m, signs, first, start_m, stop_m)
 
 
 @njit(cache=True, inline="always")
 def _cells_between(vertices_m, a, b, c, axis, low_m, cell_m, count):  # pragma: no cover (compiled)
-    """Cells along an axis whose middle lies within a triangle's extent, and a little beyond."""
-    least = min(vertices_m[a, axis], vertices_m[b, axis], vertices_m[c, axis])
-    most = max(vertices_m[a, axis], vertices_m[b, axis], vertices_m[c, axis])
-    start = int(np.floor((least - low_m) / cell_m - 0.5))
-    stop = int(np.ceil((most - low_m) / cell_m - 0.5)) + 1
+    """Range of cells along an axis whose centres are within a triangle's extent, widened against rounding."""
+    low = min(vertices_m[a, axis], vertices_m[b, axis], vertices_m[c, axis])
+    high = max(vertices_m[a, axis], vertices_m[b, axis], vertices_m[c, axis])
+    start = int(np.floor((low - low_m) / cell_m - 0.5))
+    stop = int(np.ceil((high - low_m) / cell_m - 0.5)) + 1
     return max(start, 0), min(stop, count)
 
 
 @njit(cache=True)
-def _summed(newest, older, positions, turns, first, start_m, stop_m):  # pragma: no cover (compiled)
+def _sum_common_lengths(newest, previous, crossings_m, signs, first, start_m, stop_m):  # pragma: no cover (compiled)
     length = 0.0
-    own_positions, own_turns = np.empty(len(positions)), np.empty(len(positions))
+    line_crossings_m, line_signs = np.empty(len(crossings_m)), np.empty(len(crossings_m))
     for line in range(len(newest)):
         count, number = 0, newest[line]
         while number >= 0:
-            own_positions[count], own_turns[count] = positions[number], turns[number]
+            line_crossings_m[count], line_signs[count] = crossings_m[number], signs[number]
             count += 1
-            number = older[number]
-        _sort(own_positions, own_turns, count)
+            number = previous[number]
+        _sort(line_crossings_m, line_signs, count)
         winding = 0.0
         for number in range(count):
             if winding > 0:
                 for interval in range(first[line], first[line + 1]):
-                    begin = max(own_positions[number - 1], start_m[interval])
-                    length += max(min(own_positions[number], stop_m[interval]) - begin, 0.0)
-            winding -= own_turns[number]
+                    begin = max(line_crossings_m[number - 1], start_m[interval])
+                    length += max(min(line_crossings_m[number], stop_m[interval]) - begin, 0.0)
+            winding -= line_signs[number]
     return length

@@ -17,13 +17,10 @@ SEAM = 2  # in ``ObjectModel.face_part``: a triangle with corners on both parts
 
 @dataclass(frozen=True)
 class Hinge:
-    """One revolute joint. axis: (3,) unit vector, origin_m: (3,), both in the object frame.
+    """One revolute joint: angle q moves a point p of the moving part to ``R(axis * q) (p - origin) + origin``."""
 
-    A point of the moving part at angle q lies at ``R(axis * q) (p - origin) + origin``.
-    """
-
-    axis: np.ndarray
-    origin_m: np.ndarray
+    axis: np.ndarray  # (3,) unit vector, object frame
+    origin_m: np.ndarray  # (3,) a point on the axis, object frame
 
     def turn(self, hinge_rad: np.ndarray) -> RigidTransform:
         """``object_from_part`` of the moving part at angles (frame,), radians."""
@@ -33,26 +30,24 @@ class Hinge:
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """vertices_m: (vertex, 3); faces: (face, 3) int; part: (vertex,) uint8, 0 = base, 1 = the part the hinge moves.
-
-    Its arrays are not to be changed: what follows from them is worked out once.
-    """
+    """A rigid or hinged object in its object frame. Do not change its arrays: derived values are cached."""
 
     name: str
-    vertices_m: np.ndarray
-    faces: np.ndarray
-    part: np.ndarray
+    vertices_m: np.ndarray  # (vertex, 3) at hinge angle 0
+    faces: np.ndarray  # (face, 3) int
+    part: np.ndarray  # (vertex,) uint8, 0 = base, 1 = the part that the hinge moves
     hinge: Hinge | None = None
 
     @property
     def is_articulated(self) -> bool:
+        """Whether the object has a hinge."""
         return self.hinge is not None
 
     @cached_property
     def face_part(self) -> np.ndarray:
-        """(face,) uint8, the part of each face; ``SEAM`` where its corners are on both parts, so that it is on neither.
+        """(face,) uint8, the part of each face; ``SEAM`` if its corners are on both parts.
 
-        A triangle between two parts cannot move with either: its corners would be off by the motion of the hinge.
+        A seam triangle belongs to neither part, because its corners move apart with the hinge.
         """
         if not self.is_articulated:
             return np.zeros(len(self.faces), np.uint8)
@@ -61,12 +56,12 @@ class ObjectModel:
 
     @property
     def parts(self) -> list[int]:
-        """The parts that have faces, in order; [0] for a rigid object."""
+        """Indices of the parts that have faces; [0] for a rigid object."""
         return [int(part) for part in np.unique(self.face_part) if part != SEAM] if self.is_articulated else [0]
 
     @property
     def seam_triangles(self) -> int:
-        """How many triangles span both parts. No part has them; distances and sampled points leave them out."""
+        """Number of triangles that span both parts. Distances and sampled points exclude them."""
         return int((self.face_part == SEAM).sum())
 
     def faces_of(self, part: int) -> np.ndarray:
@@ -74,10 +69,10 @@ class ObjectModel:
         return self.faces[self.face_part == part] if self.is_articulated else self.faces
 
     def closed_part(self, part: int) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (vertex, 3) and faces (face, 3) of one part, closed where the other part was cut off it.
+        """Vertices (vertex, 3) and faces (face, 3) of one part, with the cut between the parts closed.
 
-        A surface without such a cut is returned as it is stored. The closing triangles bound a volume; they are not
-        part of the object's surface.
+        A surface without such a cut is unchanged. The closing triangles bound a volume; they are not part of the
+        object's surface.
         """
         return self._closed_parts[part]
 
@@ -90,25 +85,25 @@ class ObjectModel:
 
     @cached_property
     def solids(self) -> dict[int, Solid | NoSolid]:
-        """By part, the solid that it bounds, or why it bounds none. Raises BadInput for a mesh without triangles."""
+        """By part, its solid, or the reason why it has none. Raises BadInput for a mesh without triangles."""
         return {part: solid_of(*self.closed_part(part)) for part in self.parts}
 
     def filled_part(self, part: int) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices and faces that volumes and the sign of distances are computed from: the part's solid, if any.
+        """Vertices and faces of one part for volumes and signs of distances: the repaired solid, if any.
 
-        An open mesh, and a solid that needed no repair, are returned as ``closed_part`` has them.
+        For an open mesh, and for a solid without repairs, this is ``closed_part``.
         """
         solid = self.solids[part]
         return solid[:2] if isinstance(solid, Solid) and solid.repairs else self.closed_part(part)
 
     @cached_property
     def masses(self) -> tuple[MassProperties, ...]:
-        """Mass, centre and inertia of each of ``parts``."""
+        """Volume, centre of mass and inertia of each of ``parts``, for 1 kg."""
         return tuple(mass_properties(*self.filled_part(part)) for part in self.parts)
 
     @cached_property
     def digest(self) -> str:
-        """What name, mesh, parts and hinge are, as a SHA-256, worked out once."""
+        """SHA-256 of name, mesh, parts and hinge."""
         hinge = () if self.hinge is None else (self.hinge.axis, self.hinge.origin_m)
         digest = hashlib.sha256(self.name.encode())
         for array in (self.vertices_m, self.faces, self.part, *hinge):
@@ -117,10 +112,14 @@ class ObjectModel:
         return digest.hexdigest()
 
     def object_from_part(self, part: int, hinge_rad: np.ndarray | None) -> RigidTransform:
-        """Where a part lies in the object frame, seen from its rest position (hinge angle 0), in which its mesh is.
+        """Pose of a part relative to its rest pose (hinge angle 0), in which its mesh is stored.
 
-        part: 0 for the base, which never moves against the object frame; 1 for the part the hinge moves.
-        hinge_rad: (frame,) radians, needed for part 1 only. Raises BadInput where it is missing.
+        Args:
+            part: 0 for the base, whose pose is the identity; 1 for the part that the hinge moves.
+            hinge_rad: (frame,), required for part 1.
+
+        Raises:
+            BadInput: part 1 is requested without angles.
         """
         if part == 0 or self.hinge is None:
             return IDENTITY
@@ -130,9 +129,16 @@ class ObjectModel:
 
 
 def articulate(points_m: np.ndarray, part: np.ndarray, hinge: Hinge | None, hinge_rad: np.ndarray | None) -> np.ndarray:
-    """Points of an object at each hinge angle: (frame, point, 3) metres, object frame; (1, point, 3) if it is rigid.
+    """Points of an object at each hinge angle, object frame.
 
-    points_m: (point, 3) at hinge angle 0, object frame. part: (point,) 0 or 1. hinge_rad: (frame,) radians.
+    Args:
+        points_m: (point, 3) at hinge angle 0.
+        part: (point,) 0 or 1.
+        hinge: None for a rigid object.
+        hinge_rad: (frame,), None for a rigid object.
+
+    Returns:
+        (frame, point, 3); (1, point, 3) for a rigid object.
     """
     if hinge is None or hinge_rad is None:
         return points_m[None]

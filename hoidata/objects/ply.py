@@ -1,7 +1,8 @@
 """Strict reader of PLY meshes (Turk, "The PLY Polygon File Format", 1994), text and binary.
 
-Only vertex positions and face corners are kept; colours, normals and textures are passed over. No count that a header
-states is allocated before the file is known to be long enough for it.
+Only vertex positions and face corners are kept; colours, normals and textures are skipped. The reader allocates
+nothing for a stated count until the file is known to be long enough. trimesh has no reader of mixed polygons in binary
+files, and shortens truncated text without an error.
 """
 
 import contextlib
@@ -22,16 +23,16 @@ _KINDS = {
 _CORNERS = ("vertex_indices", "vertex_index")
 MOST_VERTICES, MOST_TRIANGLES = 1_000_000, 3_000_000
 MOST_CORNERS = 10_000  # of one polygon: the lid of a finely cut cylinder may have thousands
-_MOST_WORDS = 16_000_000
+_MAX_WORDS = 16_000_000
 _STRUCT_CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
 
 
 class _Property(NamedTuple):
-    """kind: NumPy's name of the type; count_kind: of a list's length, None for a single number."""
+    """A property of an element, as the header declares it."""
 
     name: str
-    kind: str
-    count_kind: str | None
+    kind: str  # NumPy's name of the type
+    count_kind: str | None  # the type of a list's length; None for a single number
 
 
 class _Element(NamedTuple):
@@ -41,16 +42,20 @@ class _Element(NamedTuple):
 
 
 class _Column(NamedTuple):
-    """One property of an element. lengths: (row,) how many numbers each row has; values: (number,) of all rows."""
+    """The values of one property in all rows of an element."""
 
-    lengths: np.ndarray
-    values: np.ndarray
+    lengths: np.ndarray  # (row,) numbers in each row
+    values: np.ndarray  # (number,) of all rows
 
 
 def parse_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (vertex, 3) float64 and triangles (face, 3) int64; polygons become fans.
+    """Parse a PLY file; polygons become fans.
 
-    Vertices are as stored and in order. Raises ValueError when it is no PLY file, ends early or lacks either.
+    Returns:
+        Vertices (vertex, 3) float64 in the stored order, and triangles (face, 3) int64.
+
+    Raises:
+        ValueError: the file is not a PLY file, is truncated, or has no vertices.
     """
     order, elements, start = _read_header(data)
     stated = {element.name: element.count for element in elements}
@@ -60,9 +65,9 @@ def parse_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
         data, start, order = _numbers(data[start:]), 0, "<"
         as_stored = [_as_numbers(element) for element in elements]
     vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    last = _last_needed(elements)
+    last_required = _last_required(elements)
     for number, (element, stored) in enumerate(zip(elements, as_stored, strict=True)):
-        if number > last:
+        if number > last_required:
             break
         if element.name == "vertex":
             columns, start = _read_rows(data, start, order, stored, _axes(element))
@@ -76,13 +81,13 @@ def parse_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check_counts(vertices: int, triangles: int) -> None:
-    """Raise ValueError for more than a mesh may have; each takes some hundred bytes while it is read."""
+    """Raise ValueError for more than a mesh may have; each vertex or triangle takes some hundred bytes of memory."""
     if vertices > MOST_VERTICES or triangles > MOST_TRIANGLES:
         raise ValueError(f"more than {MOST_VERTICES} vertices or {MOST_TRIANGLES} triangles: decimate the mesh")
 
 
 def _read_header(data: bytes) -> tuple[str, list[_Element], int]:
-    """Byte order ("" for text), elements, and where the rows start."""
+    """Byte order ("" for text), elements, and offset of the first row."""
     end = data.find(b"end_header", 0, _LONGEST_HEADER)
     stop = data.find(b"\n", end) + 1
     if not data.startswith(b"ply") or end < 0 or not stop:
@@ -109,8 +114,8 @@ def _read_header(data: bytes) -> tuple[str, list[_Element], int]:
     return order, elements, stop
 
 
-def _last_needed(elements: list[_Element]) -> int:
-    """Number of the element with which vertices and faces are both read."""
+def _last_required(elements: list[_Element]) -> int:
+    """Index of the last element that must be read to have vertices and faces."""
     names = [element.name for element in elements]
     if "vertex" not in names:
         raise ValueError("no vertices")
@@ -120,82 +125,84 @@ def _last_needed(elements: list[_Element]) -> int:
 
 
 def _numbers(text: bytes) -> bytes:
-    """The numbers of a text file as float64, up to the first word that is none."""
-    # Counted first: a word takes fifty bytes.
-    if sum(map(text.count, (b" ", b"\n", b"\t", b"\r"))) > _MOST_WORDS:
-        raise ValueError(f"more than {_MOST_WORDS} words: decimate the mesh, or write it in binary")
+    """The numbers of a text file as float64 bytes, up to the first word that is not a number."""
+    # Count before splitting, because a word takes fifty bytes.
+    if sum(map(text.count, (b" ", b"\n", b"\t", b"\r"))) > _MAX_WORDS:
+        raise ValueError(f"more than {_MAX_WORDS} words: decimate the mesh, or write it in binary")
     words = text.split()
     if max(map(len, words), default=0) > _LONGEST_WORD:
         raise ValueError(f"a word of more than {_LONGEST_WORD} characters among its numbers")
     numbers = array("d")
-    with contextlib.suppress(ValueError):  # what follows the last needed element may be anything
+    with contextlib.suppress(ValueError):  # anything may follow the last required element
         numbers.extend(map(float, words))
     return numbers.tobytes()
 
 
 def _as_numbers(element: _Element) -> _Element:
-    """The element of a text file, once its words are float64."""
+    """The element of a text file after its words are converted to float64."""
     properties = [_Property(item.name, "f8", item.count_kind and "f8") for item in element.properties]
     return _Element(element.name, element.count, properties)
 
 
-def _read_rows(data: bytes, start: int, order: str, element: _Element, wanted: list[int]) -> tuple[list[_Column], int]:
-    """The wanted properties of an element, and where the next element starts. Linear in the number of its bytes."""
+def _read_rows(
+    data: bytes, start: int, order: str, element: _Element, properties: list[int]
+) -> tuple[list[_Column], int]:
+    """Read some properties of an element, by index. Returns their columns and the offset of the next element."""
     if element.count > MOST_TRIANGLES and any(item.count_kind for item in element.properties):
         raise ValueError(f"more than {MOST_TRIANGLES} lists: decimate the mesh")
-    first = _walk(data, start, order, element, min(1, element.count))
+    first = _locate_rows(data, start, order, element, min(1, element.count))
     lengths = first.lengths[0].tolist() if element.count else [1] * len(element.properties)
-    equal = _equal_rows(data, start, order, element, lengths, wanted)
+    equal = _equal_rows(data, start, order, element, lengths, properties)
     if equal is not None:
         return equal
-    rows = _walk(data, start, order, element, element.count)
-    _check_counts(0, int(np.maximum(rows.lengths[:, wanted] - 2, 0).sum()))
+    rows = _locate_rows(data, start, order, element, element.count)
+    _check_counts(0, int(np.maximum(rows.lengths[:, properties] - 2, 0).sum()))
     return [
-        _Column(rows.lengths[:, number], _gathered(data, order + element.properties[number].kind, rows, number))
-        for number in wanted
+        _Column(rows.lengths[:, number], _gather(data, order + element.properties[number].kind, rows, number))
+        for number in properties
     ], rows.end
 
 
 class _Rows(NamedTuple):
-    """Where rows of any length are stored. begins, lengths: (row, property) place of the first number, and how many."""
+    """Locations of rows of varying length."""
 
-    begins: np.ndarray
-    lengths: np.ndarray
-    end: int
+    begins: np.ndarray  # (row, property) offset of the first number
+    lengths: np.ndarray  # (row, property) count of numbers
+    end: int  # offset of the next element
 
 
-def _walk(data: bytes, start: int, order: str, element: _Element, count: int) -> _Rows:
-    """Find the first ``count`` rows of an element: where a row begins is known once the row before it is read."""
-    properties = [
+def _locate_rows(data: bytes, start: int, order: str, element: _Element, count: int) -> _Rows:
+    """Locate the first ``count`` rows of an element, one after the other: each row's length gives the next offset."""
+    readers = [
         (
             struct.Struct(order + _STRUCT_CODES[item.count_kind]) if item.count_kind else None,
             np.dtype(item.kind).itemsize,
         )
         for item in element.properties
     ]
-    begins, lengths, place = array("q"), array("q"), start
+    begins, lengths, offset = array("q"), array("q"), start
     try:
         for _ in range(count):
-            for counter, size in properties:
+            for counter, size in readers:
                 length = 1
                 if counter is not None:
-                    length = _checked_length(counter.unpack_from(data, place)[0])
-                    place += counter.size
-                begins.append(place)
+                    length = _checked_length(counter.unpack_from(data, offset)[0])
+                    offset += counter.size
+                begins.append(offset)
                 lengths.append(length)
-                place += length * size
+                offset += length * size
     except struct.error:
-        place = len(data) + 1
-    if place > len(data):
+        offset = len(data) + 1
+    if offset > len(data):
         raise ValueError(f"the file ends within its element {element.name[:40]!r}")
-    shape = count, len(properties)
-    return _Rows(np.array(begins, np.int64).reshape(shape), np.array(lengths, np.int64).reshape(shape), place)
+    shape = count, len(readers)
+    return _Rows(np.array(begins, np.int64).reshape(shape), np.array(lengths, np.int64).reshape(shape), offset)
 
 
 def _equal_rows(
-    data: bytes, start: int, order: str, element: _Element, lengths: list[int], wanted: list[int]
+    data: bytes, start: int, order: str, element: _Element, lengths: list[int], properties: list[int]
 ) -> tuple[list[_Column], int] | None:
-    """What ``_read_rows`` returns where every row has these lengths; else None. Most meshes are of triangles alone."""
+    """The result of ``_read_rows`` if all rows have these lengths, else None. A fast path for triangle meshes."""
     fields: list[tuple] = []
     for number, (item, length) in enumerate(zip(element.properties, lengths, strict=True)):
         if item.count_kind is not None:
@@ -209,22 +216,22 @@ def _equal_rows(
     for number, length in enumerate(lengths):
         if element.properties[number].count_kind is not None and (table[f"length{number}"] != length).any():
             return None
-    _check_counts(0, sum(max(lengths[number] - 2, 0) * element.count for number in wanted))
+    _check_counts(0, sum(max(lengths[number] - 2, 0) * element.count for number in properties))
     return [
-        _Column(np.full(element.count, lengths[number]), table[f"values{number}"].reshape(-1)) for number in wanted
+        _Column(np.full(element.count, lengths[number]), table[f"values{number}"].reshape(-1)) for number in properties
     ], end
 
 
-def _gathered(data: bytes, kind: str, rows: _Rows, number: int) -> np.ndarray:
-    """(number,) the values of one property, row after row."""
+def _gather(data: bytes, kind: str, rows: _Rows, number: int) -> np.ndarray:
+    """(number,) values of one property in all rows."""
     size, lengths = np.dtype(kind).itemsize, rows.lengths[:, number]
     within = np.arange(lengths.sum()) - (np.cumsum(lengths) - lengths).repeat(lengths)
-    places = rows.begins[:, number].repeat(lengths) + within * size
-    values = np.empty(len(places), kind)
-    for shift in range(size):  # values are not aligned: each is one of those that begin ``shift`` bytes further on
-        chosen = places % size == shift
+    offsets = rows.begins[:, number].repeat(lengths) + within * size
+    values = np.empty(len(offsets), kind)
+    for shift in range(size):  # values are unaligned: read each from the view with its alignment
+        chosen = offsets % size == shift
         if chosen.any():
-            values[chosen] = np.frombuffer(data, kind, (len(data) - shift) // size, shift)[places[chosen] // size]
+            values[chosen] = np.frombuffer(data, kind, (len(data) - shift) // size, shift)[offsets[chosen] // size]
     return values
 
 
@@ -235,7 +242,7 @@ def _checked_length(value: float) -> int:
 
 
 def _axes(element: _Element) -> list[int]:
-    """The numbers of the properties x, y and z."""
+    """Indices of the properties x, y and z."""
     names = [item.name for item in element.properties]
     numbers = [names.index(axis) for axis in "xyz" if axis in names]
     if len(numbers) < 3 or any(element.properties[number].count_kind is not None for number in numbers):
@@ -244,9 +251,9 @@ def _axes(element: _Element) -> list[int]:
 
 
 def _positions(element: _Element, columns: list[_Column]) -> np.ndarray:
-    """(vertex, 3) of the columns x, y and z; numbers in text have the precision of their declared type."""
+    """(vertex, 3) from the columns x, y and z; numbers in text are rounded to their declared type."""
     kinds = [element.properties[number].kind for number in _axes(element)]
-    with np.errstate(all="ignore"):  # signalling NaNs become quiet, too large numbers infinite: both are refused later
+    with np.errstate(all="ignore"):  # NaN and overflow to infinity are refused later
         exact = [
             column.values.astype(kind) if kind[0] == "f" else column.values
             for kind, column in zip(kinds, columns, strict=True)
@@ -255,7 +262,7 @@ def _positions(element: _Element, columns: list[_Column]) -> np.ndarray:
 
 
 def _corner_list(element: _Element) -> int:
-    """The number of the property that lists a face's corners."""
+    """Index of the property that lists a face's corners."""
     for number, item in enumerate(element.properties):
         if item.name in _CORNERS and item.count_kind:
             return number
@@ -268,10 +275,14 @@ def _fans(lists: _Column) -> np.ndarray:
     if lengths.min(initial=3) < 3:
         raise ValueError(f"a face of {lengths.min()} corners")
     with np.errstate(invalid="ignore"):
-        whole = lists.values.astype(np.float64)
-    if not (np.isfinite(whole).all() and (whole == np.rint(whole)).all() and (np.abs(whole) < 2**53).all()):
+        corner_numbers = lists.values.astype(np.float64)
+    if not (
+        np.isfinite(corner_numbers).all()
+        and (corner_numbers == np.rint(corner_numbers)).all()
+        and (np.abs(corner_numbers) < 2**53).all()
+    ):
         raise ValueError("a corner that is no whole number")
-    corners = whole.astype(np.int64)
+    corners = corner_numbers.astype(np.int64)
     triangles = lengths - 2
     first = (np.cumsum(lengths) - lengths).repeat(triangles)
     second = first + 1 + np.arange(triangles.sum()) - (np.cumsum(triangles) - triangles).repeat(triangles)

@@ -1,4 +1,4 @@
-"""The sampled points an object stands for in contact maps and networks: spread evenly, the same on every machine.
+"""Samples the points that represent an object in contact maps and networks: evenly, and equal on all machines.
 
 Farthest-point sampling (Eldar et al. 1997; PointNet++) as Text2HOI does it, over the mesh vertices where they are dense
 enough, else over a dense area-uniform sample of the surface.
@@ -25,17 +25,13 @@ SamplingMethod = Literal["vertices-fps", "surface-fps"]
 
 @dataclass(frozen=True)
 class SampledPoints:
-    """Points on an object's surface, in the object frame with the hinge at zero.
+    """Points on an object's surface, in the object frame at hinge angle 0."""
 
-    points_m: (point, 3) float32. normals: (point, 3) float32, unit. face: (point,) int32, the triangle each lies on;
-    barycentric: (point, 3) float32, its position there. part: (point,) uint8, 1 where the hinge moves the point.
-    """
-
-    points_m: np.ndarray
-    normals: np.ndarray
-    face: np.ndarray
-    barycentric: np.ndarray
-    part: np.ndarray
+    points_m: np.ndarray  # (point, 3) float32
+    normals: np.ndarray  # (point, 3) float32, unit
+    face: np.ndarray  # (point,) int32, the triangle with the point
+    barycentric: np.ndarray  # (point, 3) float32, coordinates in that triangle
+    part: np.ndarray  # (point,) uint8, 1 if the hinge moves the point
     method: SamplingMethod
 
     def __len__(self) -> int:
@@ -43,12 +39,14 @@ class SampledPoints:
 
 
 def sample_points(model: ObjectModel, count: int = POINT_COUNT) -> SampledPoints:
-    """``count`` points of the object, farthest-point order.
+    """Sample ``count`` points of the object in farthest-point order.
 
-    "vertices-fps": from the vertices, starting at the first, where at least ``count`` distinct ones lie on faces and no
-    edge is longer than 2 cm. "surface-fps": from ``32 count`` points spread over the faces in proportion to area.
-    Triangles that span both parts of a hinged object hold no point but a vertex.
-    Raises BadInput for a mesh without area.
+    If at least ``count`` distinct vertices are on faces and no edge is longer than 2 cm, the candidates are the
+    vertices, starting at the first ("vertices-fps"). Otherwise they are ``32 count`` points spread over the faces in
+    proportion to area ("surface-fps"). The latter excludes triangles that span both parts of a hinged object.
+
+    Raises:
+        BadInput: the mesh has no area.
     """
     corners = np.asarray(model.vertices_m, dtype=np.float64)[model.faces]
     if not len(corners) or not np.linalg.norm(_face_cross(corners), axis=1).any():
@@ -75,7 +73,7 @@ def _from_vertices(model: ObjectModel, count: int) -> SampledPoints:
 
 
 def _incident_face(model: ObjectModel, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For each vertex the first face it is a corner of (of its own part where there is one), and which corner."""
+    """The first face at each vertex (of the vertex's part, if any), and the index of its corner."""
     vertex = model.faces.reshape(-1)
     face, corner = np.divmod(np.arange(len(vertex)), 3)
     other_part = model.face_part[face] != model.part[vertex]
@@ -85,7 +83,7 @@ def _incident_face(model: ObjectModel, vertices: np.ndarray) -> tuple[np.ndarray
 
 
 def _vertex_normals(model: ObjectModel) -> np.ndarray:
-    """(vertex, 3) unit normals: face normals weighted by their angle at the vertex; coinciding vertices share one."""
+    """(vertex, 3) unit normals: angle-weighted face normals; coinciding vertices share a normal."""
     corners = np.asarray(model.vertices_m, dtype=np.float64)[model.faces]
     ahead = _unit(np.roll(corners, -1, axis=1) - corners)
     behind = _unit(np.roll(corners, 1, axis=1) - corners)
@@ -99,7 +97,8 @@ def _vertex_normals(model: ObjectModel) -> np.ndarray:
 
 
 def _from_surface(model: ObjectModel, corners: np.ndarray, count: int) -> SampledPoints:
-    corners = np.where((model.face_part == SEAM)[:, None, None], corners[:, :1], corners)  # no area, so no point
+    # Collapse seam triangles, so that they have no area and get no point.
+    corners = np.where((model.face_part == SEAM)[:, None, None], corners[:, :1], corners)
     face, barycentric = _spread_over_faces(corners, DENSE_FACTOR * count)
     dense = np.einsum("pc,pcx->px", barycentric, corners[face])
     chosen = farthest_points(dense, count)
@@ -115,13 +114,14 @@ def _from_surface(model: ObjectModel, corners: np.ndarray, count: int) -> Sample
 
 
 def _spread_over_faces(corners: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Systematic sample by area (each face gets its share, rounded up or down), placed by the R2 sequence."""
+    """Systematic sampling by area, with barycentric coordinates from the R2 sequence."""
     area = np.cumsum(np.linalg.norm(_face_cross(corners), axis=1))
     step = np.arange(count)
     face = np.searchsorted(area, (step + 0.5) / count * area[-1], side="right")
     u, v = (0.5 + (step[None] + 1) * np.array([[1 / PLASTIC], [1 / PLASTIC**2]])) % 1
-    beyond = u + v > 1
-    u, v = np.where(beyond, 1 - u, u), np.where(beyond, 1 - v, v)
+    is_outside = u + v > 1
+    # Fold the unit square onto the triangle u + v <= 1.
+    u, v = np.where(is_outside, 1 - u, u), np.where(is_outside, 1 - v, v)
     return face, np.column_stack([1 - u - v, u, v])
 
 

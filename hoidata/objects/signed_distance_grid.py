@@ -1,10 +1,10 @@
-"""Signed distances interpolated in grids, in torch: made once per surface from exact ones, for losses.
+"""Differentiable signed distances in torch for losses, interpolated in grids of exact distances.
 
-Both parts of many objects in one stack, with the offset to the nearest surface point: gradients flow to the points
-asked about and never into the grid. Beyond the grid the distance goes on without a jump.
+One tensor has the grids of both parts of many objects, with the offset to the closest surface point. Gradients flow to
+the query points, not into the grid. The distance is continuous beyond the grid.
 
-Whoever needs exact answers asks ``hoidata.objects.surface_index``. Its grid (``hoidata.objects.distance_grid``) serves
-the hold (``hoidata.refinement.object_field``) and the grasp search of the embedded corpora.
+``hoidata.objects.surface_index`` has exact distances. Its grid (``hoidata.objects.distance_grid``) is used in contact
+refinement (``hoidata.refinement.object_field``) and in the grasp search of the embedded corpora.
 """
 
 from collections.abc import Iterable, Sequence
@@ -23,13 +23,13 @@ FAR_M = 10.0
 
 
 class DistanceFields:
-    """Fields of many objects in one stack; clips name their object by key.
+    """Signed distance fields of many objects, which clips reference by key.
 
-    Distances are negative inside. Beyond the box of a part (its bounds and 3 cm) the distance to the box is added.
+    Distances are negative inside. Outside the box of a part (its bounds and 3 cm), the distance to the box is added.
     """
 
     def __init__(self, objects: Iterable[tuple[str, ObjectModel]], resolution: int = 40) -> None:
-        """objects: (key, model) pairs; resolution: grid points along each axis."""
+        """Compute the grids of (key, model) pairs with ``resolution`` nodes along each axis."""
         self.resolution = resolution
         self.row: dict[str, int] = {}
         values, low, high, axis, origin = [], [], [], [], []
@@ -38,8 +38,8 @@ class DistanceFields:
                 continue
             self.row[key] = len(self.row)
             for part in range(2):
-                for column, found in zip((values, low, high), _part_values(model, part, resolution), strict=True):
-                    column.append(found)
+                for stack, value in zip((values, low, high), _part_values(model, part, resolution), strict=True):
+                    stack.append(value)
             axis.append(np.zeros(3) if model.hinge is None else model.hinge.axis)
             origin.append(np.zeros(3) if model.hinge is None else model.hinge.origin_m)
         self.values = torch.from_numpy(np.concatenate(values))
@@ -47,26 +47,32 @@ class DistanceFields:
         self.axis, self.origin = _tensor(axis), _tensor(origin)
 
     def rows(self, keys: Sequence[str]) -> Tensor:
-        """(clip,) rows of the named objects."""
+        """(clip,) indices of objects by key."""
         return torch.tensor([self.row[key] for key in keys])
 
     def to(self, device: torch.device | str) -> "DistanceFields":
-        """Moves the grids; gives itself back."""
+        """Move the grids to a device. Returns self."""
         for name in ("values", "low", "high", "axis", "origin"):
             setattr(self, name, getattr(self, name).to(device))
         return self
 
     def query(self, rows: Tensor, points_m: Tensor, hinge_rad: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (B, F, P) and offset to the nearest surface point (B, F, P, 3), metres, object frame.
+        """Signed distance and offset to the closest surface point, object frame.
 
-        rows (B,), points_m (B, F, P, 3) in the object frame, hinge_rad (B, F).
+        Args:
+            rows: (B,) indices of objects.
+            points_m: (B, F, P, 3).
+            hinge_rad: (B, F).
+
+        Returns:
+            Distances (B, F, P) and offsets (B, F, P, 3), metres.
         """
         rows = send(rows, points_m.device)
-        turn = rotvec_to_rotmat(self.axis[rows][:, None] * hinge_rad[..., None])
+        rotation = rotvec_to_rotmat(self.axis[rows][:, None] * hinge_rad[..., None])
         origin = self.origin[rows][:, None, None]
         base = self._read(rows, 0, points_m)
-        lid = self._read(rows, 1, (points_m - origin) @ turn + origin)
-        lid = torch.cat((lid[..., :1], lid[..., 1:] @ turn.transpose(-1, -2)), -1)
+        lid = self._read(rows, 1, (points_m - origin) @ rotation + origin)
+        lid = torch.cat((lid[..., :1], lid[..., 1:] @ rotation.transpose(-1, -2)), -1)
         nearest = torch.where(base[..., :1] <= lid[..., :1], base, lid)
         return nearest[..., 0], nearest[..., 1:]
 
@@ -74,9 +80,9 @@ class DistanceFields:
         """(B, F, P, 4) interpolated values of one part at points (B, F, P, 3) of its rest frame."""
         low, high = self.low[rows, part][:, None, None], self.high[rows, part][:, None, None]
         inside = torch.minimum(torch.maximum(points, low), high)
-        beyond = points - inside
+        outside_m = points - inside
         node = (inside - low) / (high - low) * (self.resolution - 1)
-        # A point that is no number has no corner; its weight, and so its distance, stays no number.
+        # A NaN point has no cell; its weight, and so its distance, stays NaN.
         corner = node.detach().nan_to_num().floor().clamp_(0, self.resolution - 2)
         weight = node - corner
         x, y, z = corner.long().unbind(-1)
@@ -84,27 +90,27 @@ class DistanceFields:
             (x * self.resolution + y) * self.resolution + z + ((rows * 2 + part) * self.resolution**3)[:, None, None]
         )
         total = _blend(self.values, first, weight, (self.resolution**2, self.resolution, 1))
-        distance = total[..., 0] + (beyond.square().sum(-1) + 1e-12).sqrt() - 1e-6
-        return torch.cat((distance[..., None], total[..., 1:] - beyond), -1)
+        distance = total[..., 0] + (outside_m.square().sum(-1) + 1e-12).sqrt() - 1e-6
+        return torch.cat((distance[..., None], total[..., 1:] - outside_m), -1)
 
 
 def _blend(values: Tensor, first: Tensor, weight: Tensor, steps: tuple[int, int, int]) -> Tensor:
-    """Trilinear interpolation of rows of ``values`` at the eight corners above index ``first``."""
+    """Trilinear interpolation of rows of ``values`` at the eight corners of the cell with index ``first``."""
     total = values.new_zeros(())
     for corner in range(8):
         bits = [(corner >> axis) & 1 for axis in range(3)]
-        share = values.new_ones(())
+        corner_weight = values.new_ones(())
         for axis, bit in enumerate(bits):
-            share = share * (weight[..., axis] if bit else 1 - weight[..., axis])
+            corner_weight = corner_weight * (weight[..., axis] if bit else 1 - weight[..., axis])
         shift = sum(bit * step for bit, step in zip(bits, steps, strict=True))
-        total = total + share[..., None] * values[first + shift]
+        total = total + corner_weight[..., None] * values[first + shift]
     return total
 
 
 def _part_values(model: ObjectModel, part: int, resolution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of one part (of a rigid object all, and no second): rows (node, 4) of signed distance and offset, and the box.
+    """Signed distances and offsets (node, 4) of one part, and the low and high corners of its grid.
 
-    An object without the part is far away from everything.
+    A part that the object does not have is far away from all points.
     """
     if part not in model.parts:
         values = np.zeros((resolution**3, 4), np.float32)
@@ -115,8 +121,8 @@ def _part_values(model: ObjectModel, part: int, resolution: int) -> tuple[np.nda
     low, high = box[:3] - MARGIN_M, box[3:] + MARGIN_M
     axes = [np.linspace(low[axis], high[axis], resolution) for axis in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    found = surface.nearest(nodes)
-    values = np.column_stack((found.distance_m, found.closest_m - nodes))
+    nearest = surface.nearest(nodes)
+    values = np.column_stack((nearest.distance_m, nearest.closest_m - nodes))
     return values.astype(np.float32), low, high
 
 

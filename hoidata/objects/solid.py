@@ -1,8 +1,8 @@
-"""What a mesh encloses: as it is, or after small repairs that are said aloud.
+"""The solid that a mesh encloses, after small repairs that are reported.
 
-Repaired are triangles that lie double (a surface drawn once for each side), uneven orientation, surfaces turned inside
-out, and holes that a patch of 1 % of the surface closes. A cup drawn as one open sheet stays open: nothing says how
-thick it is.
+Repairs: duplicate triangles (a surface modelled once per side), inconsistent orientation, inverted surfaces, and holes
+whose patch is at most 1 % of the surface. A cup modelled as one open sheet stays open, because its thickness is
+unknown.
 """
 
 from collections import defaultdict
@@ -15,74 +15,78 @@ from scipy.spatial import ConvexHull, QhullError
 from hoidata.geometry.rows import distinct_rows
 from hoidata.objects.distance import is_closed, merged_surface, unmatched_edges, volume_m3
 
-LARGEST_PATCH = 0.01
-LEAST_SHARE = 1e-3  # of the convex hull: less is enclosed by two opposite sheets
+LARGEST_PATCH = 0.01  # fraction of the surface's area
+MIN_HULL_FRACTION = 1e-3  # two opposite sheets enclose less of their convex hull
 
 
 class Solid(NamedTuple):
-    """A closed surface, outward by the right-hand rule: vertices_m (vertex, 3), faces (face, 3).
+    """A closed surface with outward normals by the right-hand rule."""
 
-    repairs: what was changed, empty for a mesh taken as it is. patched: the surface has more than the mesh's triangles.
-    """
-
-    vertices_m: np.ndarray
-    faces: np.ndarray
-    repairs: str
-    patched: bool
+    vertices_m: np.ndarray  # (vertex, 3)
+    faces: np.ndarray  # (face, 3)
+    repairs: str  # a list in words; empty for an unchanged mesh
+    patched: bool  # triangles were added to close holes
 
 
 class NoSolid(NamedTuple):
-    """why: what keeps a mesh from having an inside, in words."""
+    """The result for a mesh without an inside."""
 
-    why: str
+    why: str  # the reason, in words
 
 
 def solid_of(vertices_m: np.ndarray, faces: np.ndarray) -> Solid | NoSolid:
-    """The solid that a mesh (vertex, 3), (face, 3) bounds, metres. Raises BadInput for a mesh without triangles."""
+    """The solid that a mesh (vertex, 3), (face, 3) bounds. Raises BadInput for a mesh without triangles."""
     surface = merged_surface(vertices_m, faces)
-    vertices, found = surface.vertices_m, surface.faces
+    vertices, triangles = surface.vertices_m, surface.faces
     repairs = []
-    if not (is_closed(found) and encloses(vertices, found)):
-        # One triangle of each set of three vertices, the first.
-        single = found[np.sort(distinct_rows(np.sort(found, axis=1)).first)]
-        if len(single) < len(found):
-            repairs.append(f"{len(found) - len(single)} triangles that lay double left out")
-        found = single if is_closed(single) else np.ascontiguousarray(igl.bfs_orient(single)[0], dtype=np.int64)
-        if len(single) == len(surface.faces) and not np.array_equal(found, single):
+    if not (is_closed(triangles) and encloses(vertices, triangles)):
+        # Of triangles with the same vertices, keep the first.
+        single = triangles[np.sort(distinct_rows(np.sort(triangles, axis=1)).first)]
+        if len(single) < len(triangles):
+            repairs.append(f"{len(triangles) - len(single)} triangles that lay double left out")
+        triangles = single if is_closed(single) else np.ascontiguousarray(igl.bfs_orient(single)[0], dtype=np.int64)
+        if len(single) == len(surface.faces) and not np.array_equal(triangles, single):
             repairs.append("neighbouring triangles turned alike")
-    holes = _holes(found)
+    holes = _holes(triangles)
     patched = bool(holes)
-    if holes is None or not all(_is_small(vertices, found, hole) for hole in holes):
+    if holes is None or not all(_is_small(vertices, triangles, hole) for hole in holes):
         return NoSolid("it is open" if holes else "its triangles do not meet at their edges two by two")
     if holes:
         repairs.append(f"{len(holes)} small hole{'s' if len(holes) > 1 else ''} closed")
-        vertices, found = _patched(vertices, found, holes)
-    if not encloses(vertices, found):
+        vertices, triangles = _patched(vertices, triangles, holes)
+    if not encloses(vertices, triangles):
         return NoSolid("it encloses nothing")
-    if volume_m3(vertices, found) < 0:
+    if volume_m3(vertices, triangles) < 0:
         repairs.append("triangles turned outward")
-        found = np.ascontiguousarray(found[:, ::-1])
-    return Solid(vertices, found, ", ".join(repairs), patched)
+        triangles = np.ascontiguousarray(triangles[:, ::-1])
+    return Solid(vertices, triangles, ", ".join(repairs), patched)
 
 
 def encloses(vertices_m: np.ndarray, faces: np.ndarray) -> bool:
-    """A closed surface holds more than 0.1 % of its convex hull."""
+    """Whether a closed surface encloses more than 0.1 % of its convex hull."""
     used = vertices_m[np.unique(faces)]
     volume = abs(volume_m3(vertices_m, faces))
-    if volume > LEAST_SHARE * np.prod(np.ptp(used, axis=0)) > 0:
-        return True  # the hull lies in its box, and a hull of 100,000 places takes seconds
+    if volume > MIN_HULL_FRACTION * np.prod(np.ptp(used, axis=0)) > 0:
+        return True  # the box bounds the hull, and a hull of 100,000 points takes seconds
     try:
         hull = ConvexHull(used).volume
     except (QhullError, ValueError):  # flat, or fewer than four points
         return False
-    return volume > LEAST_SHARE * hull
+    return volume > MIN_HULL_FRACTION * hull
 
 
 def close_cut(vertices_m: np.ndarray, faces: np.ndarray, neighbours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of a part (face, 3), closed by fans where ``neighbours`` (face, 3) were cut off it.
+    """Close a part with fans where it was cut off the rest of its mesh.
 
-    vertices_m: (vertex, 3) of the whole mesh; the fans' centres come after them. A hole is a cut where a neighbour
-    meets one of its edges; cuts are closed whatever their size. Other holes stay.
+    A hole is a cut if a neighbouring triangle shares one of its edges. Cuts of any size are closed; other holes stay.
+
+    Args:
+        vertices_m: (vertex, 3) of the whole mesh.
+        faces: (face, 3) of the part.
+        neighbours: (face, 3) of the rest of the mesh.
+
+    Returns:
+        Vertices, with the centres of the fans appended, and faces of the part.
     """
     first, number = distinct_rows(np.ascontiguousarray(vertices_m, dtype=np.float64))
     holes = _holes(number[faces]) if len(neighbours) else None
@@ -95,10 +99,17 @@ def close_cut(vertices_m: np.ndarray, faces: np.ndarray, neighbours: np.ndarray)
 
 
 def patched_holes(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh with every hole closed by a fan about the middle of its edge, whatever its size: a hand at its wrist.
+    """Close all holes of a mesh, such as a hand's wrist, with fans about the centres of their edges.
 
-    vertices_m: (..., vertex, 3), any number of poses; faces: (face, 3). The fans' middles come after the mesh's own
-    vertices. Raises ValueError where an edge has more than two triangles.
+    Args:
+        vertices_m: (..., vertex, 3), any number of poses.
+        faces: (face, 3).
+
+    Returns:
+        Vertices, with the centres of the fans appended, and faces.
+
+    Raises:
+        ValueError: an edge has more than two triangles.
     """
     holes = _holes(faces)
     if holes is None:
@@ -107,15 +118,15 @@ def patched_holes(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
 
 
 def _holes(faces: np.ndarray) -> list[np.ndarray] | None:
-    """Vertices around each hole, in the order a patch's triangles run; None where an edge is open more than once.
+    """Vertices around each hole, in the order of a patch's triangles; None if an edge is open more than once.
 
-    Holes that share a vertex are told apart there, so that no hole passes a vertex twice.
+    Holes that share a vertex are separated there, so that no hole visits a vertex twice.
     """
     edges, unmatched = unmatched_edges(faces)
     if unmatched.max(initial=0) > 1:
         return None
     after: defaultdict[int, list[int]] = defaultdict(list)
-    for stop, start in edges[unmatched > 0].tolist():  # a patch runs against the triangles next to it
+    for stop, start in edges[unmatched > 0].tolist():  # a patch has the opposite direction of its neighbours
         after[start].append(stop)
     holes: list[np.ndarray] = []
     for start in sorted(after):

@@ -1,7 +1,8 @@
 """Reader of STL meshes, binary and text (3D Systems, "StereoLithography Interface Specification", 1989).
 
-Corners come as they are stored, three of their own for each triangle. Stored normals and attributes are ignored. Some
-programs start binary files with "solid" as well, so the length decides.
+Each triangle has three separate corners, in the stored order. Stored normals and attributes are ignored. Some programs
+start binary files with "solid" as well, so the length decides. trimesh drops a truncated solid without an error, and
+takes quadratic time for solids with equal names.
 """
 
 import io
@@ -12,19 +13,19 @@ import numpy as np
 
 _HEADER_BYTES, _ROW_BYTES = 84, 50
 _ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_MOST_WORDS = 5  # of a line that counts: "facet normal x y z"
+_MAX_WORDS = 5  # of a line that counts: "facet normal x y z"
 
 
 class Stl(NamedTuple):
-    """corners: (3 * triangle, 3) float64. solid: (triangle,) number of the solid; names: of the solids."""
+    """The triangles of an STL file."""
 
-    corners: np.ndarray
-    solid: np.ndarray
-    names: list[str]
+    corners: np.ndarray  # (3 * triangle, 3) float64
+    solid: np.ndarray  # (triangle,) index of the solid
+    names: list[str]  # of the solids
 
 
 def parse_stl(data: bytes) -> Stl:
-    """The triangles of an STL file. Raises ValueError when it is none or ends early."""
+    """Parse the triangles of an STL file. Raises ValueError if it is not an STL file or is truncated."""
     count = int.from_bytes(data[80:_HEADER_BYTES], "little")
     expected = _HEADER_BYTES + _ROW_BYTES * count
     if len(data) >= _HEADER_BYTES and len(data) == expected:
@@ -45,7 +46,7 @@ def _text(data: bytes) -> Stl:
     names = [""]
     numbers, solids, corners = array("d"), array("q"), 0
     for line in io.BytesIO(data):
-        words = line.split(maxsplit=_MOST_WORDS)
+        words = line.split(maxsplit=_MAX_WORDS)
         match words[0].lower() if words else b"":
             case b"vertex" if len(words) >= 4:
                 numbers.extend((float(words[1]), float(words[2]), float(words[3])))
@@ -56,7 +57,7 @@ def _text(data: bytes) -> Stl:
                 solids.append(len(names) - 1)
                 corners = 0
             case b"solid":
-                if len(names) - 1 in solids[-1:]:  # a solid without triangles is none
+                if len(names) - 1 in solids[-1:]:  # ignore a solid without triangles
                     names.append("")
                 names[-1] = line.strip()[5:65].decode(errors="replace").strip()
             case _:

@@ -1,8 +1,8 @@
-"""One object's surface, ready for many questions: is a point nearer than a threshold, how far is it, how deep inside.
+"""Distance queries on one object's surface: within a threshold, distance, penetration depth, closest point.
 
-Positions are in the object frame; each part answers in its own rest frame, where its surface never changes, so one
-index serves every frame of every clip at every hinge angle. All answers are exact: a grid of distances only saves
-looking at triangles, and is made when an object is asked about so often that this pays.
+Query positions are in the object frame. Each part is queried in its rest frame, where its surface never changes. So one
+index serves all frames of all clips at any hinge angle. All answers are exact. An object with many queries gets a grid
+of distances, which only saves tests of triangles.
 """
 
 from collections import OrderedDict
@@ -26,37 +26,38 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.solid import NoSolid, Solid
 from hoidata.objects.triangle_tree import TriangleTree, triangle_tree
 
-GRID_PAYS_FROM = 1_000_000  # positions; a grid takes 0.1-0.5 s and saves 0.05 us (within) to 0.3 us (depth) on each
-ON_SURFACE_M = 1e-6  # nearer than this the direction to the surface is rounding; the triangle's normal is used
-MOST_TRIANGLES_KEPT = 1_000_000  # in memory, about 200 MB
+GRID_PAYS_FROM = 1_000_000  # queries; a grid takes 0.1-0.5 s and saves 0.05 us (within) to 0.3 us (depth) per query
+ON_SURFACE_M = 1e-6  # below this distance the direction to the surface is rounding, so the triangle's normal is used
+MAX_CACHED_TRIANGLES = 1_000_000  # about 200 MB
 _indices: OrderedDict[str, "SurfaceIndex"] = OrderedDict()
 
 
 class PartSurface:
-    """One part's triangles in a tree, and their grid once it pays. Positions are in the part's rest frame."""
+    """Distance queries on one part, in the part's rest frame. The grid is computed after ``grid_after`` queries."""
 
-    def __init__(self, vertices_m: np.ndarray, faces: np.ndarray, closed: bool, grid_from: int) -> None:
+    def __init__(self, vertices_m: np.ndarray, faces: np.ndarray, closed: bool, grid_after: int) -> None:
         self.tree, self.closed = triangle_tree(vertices_m, faces), closed
-        self._grid_from, self._asked, self._grid = grid_from, 0, no_grid()
+        self._grid_after, self._n_queries, self._grid = grid_after, 0, no_grid()
 
     @property
     def has_grid(self) -> bool:
+        """Whether the grid of distances has been computed."""
         return self._grid.value.size > 0
 
     def grid_for(self, positions_m: np.ndarray) -> DistanceGrid:
-        """The grid to answer about these positions with."""
-        self._asked += len(positions_m)
-        return self.grid if self._asked > self._grid_from else self._grid
+        """The grid for a query of these positions; it may have no nodes yet."""
+        self._n_queries += len(positions_m)
+        return self.grid if self._n_queries > self._grid_after else self._grid
 
     @property
     def grid(self) -> DistanceGrid:
-        """Made when it is first asked for, which takes 0.1-0.5 s."""
+        """The grid of distances. The first access computes it in 0.1-0.5 s."""
         if not self.has_grid:
             self._grid = distance_grid(self.tree, self.closed)
         return self._grid
 
     def inside(self, positions_m: np.ndarray) -> np.ndarray:
-        """(position,) bool: inside the solid; never where the part bounds none."""
+        """(position,) bool: inside the solid; False if the part bounds no solid."""
         if not self.closed:
             return np.zeros(len(positions_m), bool)
         side = sides(self.tree, self.grid_for(positions_m), positions_m)
@@ -77,60 +78,66 @@ class PartSurface:
         return signed
 
     def nearest(self, positions_m: np.ndarray) -> SignedDistance:
-        """Signed distance and nearest place; ``normal`` is the gradient of the distance, outward, of length 1.
+        """Signed distance, closest surface point and unit gradient of the distance.
 
-        Of positions that are not finite the distance is infinite, the rest NaN.
+        Positions that are not finite get an infinite distance; the rest is NaN.
         """
         signed = self.signed_m(positions_m)
         distance = np.abs(signed)
         closest, triangle = np.full((len(positions_m), 3), np.nan), np.zeros(len(positions_m), np.int64)
         nearest_triangles(self.tree, positions_m, distance, closest, triangle)
-        way = positions_m - closest
-        away = distance > ON_SURFACE_M
-        gradient = self.tree.triangle[9:12, triangle].T
-        gradient[away] = way[away] / signed[away, None]
+        offset_m = positions_m - closest
+        is_off_surface = distance > ON_SURFACE_M
+        gradient = self.tree.triangle[9:12, triangle].T  # the normal, for points on the surface
+        gradient[is_off_surface] = offset_m[is_off_surface] / signed[is_off_surface, None]
         return SignedDistance(signed, closest, gradient)
 
 
 def surface_index(model: ObjectModel) -> "SurfaceIndex":
-    """The index of a model; those used last are kept in memory, by what mesh, parts and hinge are."""
+    """The index of a model, from a cache of the most recently used ones that is keyed by the model's digest."""
     key = model.digest
     if key not in _indices:
         _indices[key] = SurfaceIndex(model)
     _indices.move_to_end(key)
-    while len(_indices) > 1 and sum(len(kept.model.faces) for kept in _indices.values()) > MOST_TRIANGLES_KEPT:
+    while len(_indices) > 1 and sum(len(index.model.faces) for index in _indices.values()) > MAX_CACHED_TRIANGLES:
         _indices.popitem(last=False)
     return _indices[key]
 
 
 class SurfaceIndex:
-    """The surface of one object; of a hinged one that of both parts, at the angle of each frame.
+    """Distance queries on the surface of one object, at the hinge angle of each frame."""
 
-    solids: by part, the solid it bounds, or why there is none. solid_note: None where every part is one as it is, else
-    a sentence that says what was repaired or left out of depths. grid_from: a part gets its grid when it is asked about
-    more positions than this. Raises BadInput for a part without triangles.
-    """
+    def __init__(self, model: ObjectModel, grid_after: int = GRID_PAYS_FROM) -> None:
+        """Index the parts of a model; each part gets its grid after ``grid_after`` queries.
 
-    def __init__(self, model: ObjectModel, grid_from: int = GRID_PAYS_FROM) -> None:
+        Raises:
+            BadInput: a part has no triangles.
+        """
         self.model = model
-        self.solids = model.solids
-        self.solid_note = _note(model, self.solids)
+        self.solids = model.solids  # by part, the solid that it bounds or the reason why it bounds none
+        self.solid_note = _note(model, self.solids)  # repairs, and parts excluded from depths; None without either
         self._surfaces: dict[int, PartSurface] = {}
         self._closed: dict[int, PartSurface] = {}
         for part, solid in self.solids.items():
             if isinstance(solid, Solid):
-                self._closed[part] = PartSurface(solid.vertices_m, solid.faces, True, grid_from)
+                self._closed[part] = PartSurface(solid.vertices_m, solid.faces, True, grid_after)
+            # Added triangles bound the inside, but are not part of the surface: distances use the original mesh then.
             if isinstance(solid, Solid) and not solid.patched and not _has_cut(model, part):
                 self._surfaces[part] = self._closed[part]
             else:
                 merged = merged_surface(model.vertices_m, model.faces_of(part))
-                self._surfaces[part] = PartSurface(merged.vertices_m, merged.faces, False, grid_from)
+                self._surfaces[part] = PartSurface(merged.vertices_m, merged.faces, False, grid_after)
 
     def within(self, positions_m: np.ndarray, hinge_rad: np.ndarray | None, threshold_m: float) -> np.ndarray:
-        """(frame, position) bool: the distance to the surface is less than ``threshold_m``.
+        """Whether each position is closer to the surface than a threshold; False for positions that are not finite.
 
-        positions_m: (frame, position, 3), object frame, metres. hinge_rad: (frame,) for a hinged object, else None.
-        Positions that are not finite are not within.
+        Args:
+            positions_m: (frame, position, 3), object frame.
+            hinge_rad: (frame,) for a hinged object, else None.
+            threshold_m: exclusive.
+
+        Returns:
+            (frame, position) bool.
         """
         within = np.zeros(positions_m.shape[:2], bool)
         for part, surface in self._surfaces.items():
@@ -139,7 +146,7 @@ class SurfaceIndex:
         return within
 
     def distance_m(self, positions_m: np.ndarray, hinge_rad: np.ndarray | None, most_m: float = np.inf) -> np.ndarray:
-        """(frame, position) float64 distance to the surface, metres, never negative; infinite beyond ``most_m``.
+        """(frame, position) float64 unsigned distance to the surface, infinite beyond ``most_m``.
 
         Arguments as in ``within``.
         """
@@ -150,11 +157,13 @@ class SurfaceIndex:
         return distance
 
     def depth_m(self, positions_m: np.ndarray, hinge_rad: np.ndarray | None) -> np.ndarray:
-        """(frame, position) float64 distance to the surface for positions inside the solid, metres, 0 outside.
+        """(frame, position) float64 penetration depth: the distance to the surface inside the solid, 0 outside.
 
-        Inside is what the surface winds around (a cavity is outside, two shells that overlap count as one solid); of
-        two parts the one that it is deeper in counts. Arguments as in ``within``. Raises BadInput where no part
-        encloses a solid.
+        Inside means a positive winding number: a cavity is outside, and overlapping shells count as one solid. With two
+        parts, the larger depth counts. Arguments as in ``within``.
+
+        Raises:
+            BadInput: no part encloses a solid.
         """
         self.check_solid()
         depth = np.zeros(positions_m.shape[:2])
@@ -165,42 +174,42 @@ class SurfaceIndex:
         return depth
 
     def nearest(self, positions_m: np.ndarray, hinge_rad: np.ndarray | None) -> SignedDistance:
-        """Signed distances (frame, position), nearest places and gradients (frame, position, 3), object frame.
+        """Signed distances (frame, position), closest points and gradients (frame, position, 3), object frame.
 
-        Of ``filled``; of two parts the one whose signed distance is less. Arguments as in ``within``.
+        Uses ``filled``. With two parts, the smaller signed distance counts. Arguments as in ``within``.
         """
         return reduce(nearer_of, (self._nearest_of(part, positions_m, hinge_rad) for part in self.filled))
 
     def _nearest_of(self, part: int, positions_m: np.ndarray, hinge_rad: np.ndarray | None) -> SignedDistance:
-        found = self.filled[part].nearest(self._in_part(positions_m, hinge_rad, part))
+        nearest = self.filled[part].nearest(self._in_part(positions_m, hinge_rad, part))
         object_from_part = self.model.object_from_part(part, hinge_rad)
-        closest, normal = (array.reshape(positions_m.shape) for array in found[1:])
-        distance = found.distance_m.reshape(positions_m.shape[:2])
+        closest, normal = (array.reshape(positions_m.shape) for array in nearest[1:])
+        distance = nearest.distance_m.reshape(positions_m.shape[:2])
         return SignedDistance(distance, object_from_part @ closest, object_from_part.turn(normal))
 
     @property
     def filled(self) -> dict[int, PartSurface]:
-        """By part the solid's surface, with its repairs, or the open mesh where there is no solid."""
+        """By part, the repaired surface of the solid, or the open mesh of a part without a solid."""
         return {part: self._closed.get(part, surface) for part, surface in self._surfaces.items()}
 
     def prepare(self) -> "SurfaceIndex":
-        """Make all grids now, 0.1-0.5 s for each part, for whoever cannot wait later; gives itself back."""
+        """Compute all grids now, in 0.1-0.5 s per part, so that no later query waits. Returns self."""
         for surface in {**self._surfaces, **self.filled}.values():
             _ = surface.grid
         return self
 
     @property
     def solid_trees(self) -> dict[int, TriangleTree]:
-        """By part, the triangles of the solid it bounds; parts that bound none are left out."""
+        """By part, the triangles of the solid; only parts that bound a solid."""
         return {part: surface.tree for part, surface in self._closed.items()}
 
     @property
     def is_solid(self) -> bool:
-        """Some part encloses a solid, so that depths can be asked for."""
+        """Whether some part encloses a solid, so that depths are defined."""
         return bool(self._closed)
 
     def check_solid(self) -> None:
-        """Raises BadInput where no part encloses a solid, with the reason."""
+        """Raise BadInput with the reason if no part encloses a solid."""
         if not self.is_solid:
             why = "; ".join(sorted({solid.why for solid in self.solids.values() if isinstance(solid, NoSolid)}))
             raise BadInput(f"mesh of {self.model.name!r}", "a mesh that encloses a solid", why, "repair the mesh")
@@ -212,26 +221,26 @@ class SurfaceIndex:
 
 
 def nearer_of(first: SignedDistance, second: SignedDistance) -> SignedDistance:
-    """Of two answers about the same positions, each time the one whose signed distance is less."""
+    """Of two results for the same positions, the one with the smaller signed distance at each position."""
     nearer = second.distance_m < first.distance_m
     columns = zip(first, second, strict=True)
     return SignedDistance(*(np.where(nearer[(..., *[None] * (a.ndim - nearer.ndim))], b, a) for a, b in columns))
 
 
 def _has_cut(model: ObjectModel, part: int) -> bool:
-    """Triangles close the part where the other part was cut off it."""
+    """Whether triangles close the cut between the part and the other part."""
     return len(model.closed_part(part)[1]) > len(model.faces_of(part))
 
 
 def _note(model: ObjectModel, solids: dict[int, Solid | NoSolid]) -> str | None:
-    """What was repaired, and what has no inside; None where there is nothing to say."""
-    said = []
+    """Repairs, and parts without an inside, as one sentence; None without either."""
+    notes = []
     for part, solid in solids.items():
         name = f"part {part} of {model.name}" if len(solids) > 1 else model.name
         if isinstance(solid, NoSolid):
-            said.append(f"{name} has no inside: {solid.why}")
+            notes.append(f"{name} has no inside: {solid.why}")
             continue
         repairs = [*(["cut at the hinge closed"] if _has_cut(model, part) else []), *filter(None, [solid.repairs])]
         if repairs:
-            said.append(f"{name}: {', '.join(repairs)}")
-    return "; ".join(said) or None
+            notes.append(f"{name}: {', '.join(repairs)}")
+    return "; ".join(notes) or None

@@ -1,4 +1,4 @@
-"""An object from a mesh somebody has: its unit, which way is up, its hinge; each is told, or found and said."""
+"""Reads a user's mesh as an object. Unit, up axis and hinge are given, or guessed and reported."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,86 +18,93 @@ from hoidata.objects.stl import parse_stl
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "dm": 0.1, "inch": 0.0254}
 SMALLEST_M, LARGEST_M = 0.005, 2.0
-HELD_M = (0.02, 1.0)  # sizes a hand is likely to be asked to hold, for guesses of a unit
+GRASPABLE_M = (0.02, 1.0)  # likely sizes of an object that a hand grasps, to guess the unit
 UP_AXES = {
     sign + letter: np.eye(3)[axis] * float(f"{sign}1") for axis, letter in enumerate("xyz") for sign in ("", "-")
 }
-MERGED_PER_UNIT = 1e8  # vertices of STL and GLB are one where they agree to this fraction of the file's unit
+MERGE_PRECISION = 1e8  # vertices of STL and GLB are merged if they agree to 1 / this of the file's unit
 METRES_AND_Y_UP = (".glb",)  # by the glTF 2.0 specification
-NEAR_GROUND = 1 / 50  # of the height: vertices this low carry the object
-SLIGHTLY_RAD, NEARER = 0.3, 0.01  # a turn that shows where a hinge leads, and how much nearer is meant
-CLEARLY = 1.5  # standing on y must give so much more footing than on z, which most datasets use
-STANDS = 0.1  # of its outline: an object that rolls or rocks on y, as a bowl on its side, does not stand there ...
-FAR_MORE = 10.0  # ... unless on z it has hardly any footing, as a glass with a narrow foot that lies
+GROUND_FRACTION = 1 / 50  # of the height: vertices below it are the footing
+CLOSING_TEST_RAD = 0.3  # hinge angle at which the direction of the hinge is tested
+CLOSING_FRACTION = 0.01  # a hinge closes if the parts' centres approach by this fraction
+Y_UP_RATIO = 1.5  # y is up only if its footing is larger than that of z, the usual axis, by this factor
+STABLE_FOOTING = 0.1  # of the outline; with less, an object such as a bowl on its side rolls or rocks
+Y_UP_MARGIN_UNSTABLE = 10.0  # factor for y with less footing than that, such as a glass with a narrow foot
 
 
 @dataclass(frozen=True)
 class UserObject:
-    """model: metres, z up, its origin where the file has it. notes: what was assumed, in words a person reads."""
+    """An object read from a user's mesh file."""
 
-    model: ObjectModel
-    notes: tuple[str, ...]
+    model: ObjectModel  # metres, z up, with the file's origin
+    notes: tuple[str, ...]  # assumptions, as sentences for the user
 
 
 def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "") -> UserObject:
-    """An object from an OBJ, PLY, STL or GLB file.
+    """Read an object from an OBJ, PLY, STL or GLB file.
 
-    unit: "m", "cm", "mm", "dm" or "inch"; metres where not told. up: "z", "-y", ...; found where not told (GLB: y).
-    hinge: "px,py,pz dx,dy,dz", a point on the axis and its direction in the file's own unit and axes, for a mesh of two
-    pieces of which the second in the file moves. The pieces are the objects, groups, nodes or solids that the file
-    names where these are two, and else the shells.
-    Raises BadInput for a size that cannot be meant, naming the unit that may be, and for a hinge that does not fit.
+    Args:
+        path: the mesh file.
+        unit: "m", "cm", "mm", "dm" or "inch"; metres by default.
+        up: the file's axis that points up, such as "z" or "-y"; guessed by default (GLB: y).
+        hinge: "px,py,pz dx,dy,dz", a point on the axis and its direction in the file's unit and axes. The mesh must
+            have two pieces, of which the second in the file moves. Pieces are the objects, groups, nodes or solids that
+            the file names if there are two, else the shells.
+
+    Raises:
+        BadInput: the size is implausible (the error suggests a unit), or the hinge does not fit.
     """
     file = _read(path)
     mesh, part, pieces = _in_two_pieces(path, file) if hinge else (_joined(file), None, ("", ""))
     scale, notes = _scale(path, mesh, unit), list[str]()
     vertices = mesh.vertices * scale
     if not up:
-        up, note = ("y", "y is up, as in every GLB file") if _is_gltf(path) else found_up(vertices)
+        up, note = ("y", "y is up, as in every GLB file") if _is_gltf(path) else guess_up(vertices)
         notes.append(f"{note}; --up chooses another")
     if up not in UP_AXES:
         raise BadInput("--up", f"one of {', '.join(UP_AXES)}", up, "name the axis of the file that points up")
-    turn = _upright_from_file(UP_AXES[up])
-    joint = _hinge(hinge, scale, turn) if hinge else None
+    upright_from_file = _upright_from_file(UP_AXES[up])
+    hinge_joint = _hinge(hinge, scale, upright_from_file) if hinge else None
     part = np.zeros(len(vertices), np.uint8) if part is None else part
-    name = path.stem.encode(errors="backslashreplace").decode()  # bytes that are no text stay legible
-    model = ObjectModel(name, vertices @ turn.T, mesh.faces, part, joint)
+    name = path.stem.encode(errors="backslashreplace").decode()  # bytes that are not text stay legible
+    model = ObjectModel(name, vertices @ upright_from_file.T, mesh.faces, part=part, hinge=hinge_joint)
     if all(pieces):
         notes.append(f"{pieces[1]!r} turns about the hinge, {pieces[0]!r} stays")
-    if joint and closes(model):
+    if hinge_joint and closes(model):
         notes.append("a growing angle brings the two pieces together; if it is to open them, turn its direction round")
     return UserObject(model, tuple(notes))
 
 
 def closes(model: ObjectModel) -> bool:
-    """Whether the middle of an articulated object's moving part comes nearer to that of its base as its angle grows."""
+    """Whether the centre of an articulated object's moving part approaches that of its base as the angle grows."""
     base, moving = (masses.centre_m for masses in model.masses)
-    before, after = articulate(moving[None], np.ones(1), model.hinge, np.array([-SLIGHTLY_RAD, SLIGHTLY_RAD]))[:, 0]
-    return bool(np.linalg.norm(after - base) < (1 - NEARER) * np.linalg.norm(before - base))
+    angles_rad = np.array([-CLOSING_TEST_RAD, CLOSING_TEST_RAD])
+    before, after = articulate(moving[None], np.ones(1), model.hinge, angles_rad)[:, 0]
+    return bool(np.linalg.norm(after - base) < (1 - CLOSING_FRACTION) * np.linalg.norm(before - base))
 
 
-def found_up(vertices_m: np.ndarray) -> tuple[str, str]:
-    """Which axis of a mesh points up, and why: "z", or "y" where the object then stands on clearly more ground."""
+def guess_up(vertices_m: np.ndarray) -> tuple[str, str]:
+    """Guess the up axis of a mesh, "z" or "y" (if the footing is clearly larger), with the reason as a sentence."""
     on_z, on_y = footing(vertices_m, 2), footing(vertices_m, 1)
-    if on_y > CLEARLY * on_z and (on_y > STANDS or on_y > FAR_MORE * on_z):
+    if on_y > Y_UP_RATIO * on_z and (on_y > STABLE_FOOTING or on_y > Y_UP_MARGIN_UNSTABLE * on_z):
         return "y", f"up: y (it stands on {on_y:.0%} of its outline; with z up on {on_z:.0%})"
-    if on_z < STANDS:
+    if on_z < STABLE_FOOTING:
         return "z", "up: z, assumed: it stands firmly with neither y nor z up"
     return "z", f"up: z (it stands on {on_z:.0%} of its outline)"
 
 
 def footing(vertices_m: np.ndarray, axis: int) -> float:
-    """How much of the object's outline seen from above (area of its convex hull) touches the ground, 0 to 1."""
+    """Fraction of the outline seen from above (area of its convex hull) that touches the ground, 0 to 1."""
     height = vertices_m[:, axis]
     flat = np.delete(vertices_m, axis, axis=1)
-    low = height <= height.min() + NEAR_GROUND * np.ptp(height)
+    low = height <= height.min() + GROUND_FRACTION * np.ptp(height)
     return _hull_area(flat[low]) / max(_hull_area(flat), 1e-12)
 
 
-def thinned(model: ObjectModel, most_faces: int) -> ObjectModel:
-    """The object with at most about ``most_faces`` faces, for drawing: vertices of one cell of a grid become one."""
+def thinned(model: ObjectModel, max_faces: int) -> ObjectModel:
+    """Simplify an object for display to about ``max_faces`` faces: vertices in one cell of a grid are merged."""
     cells = 256
-    while len(model.faces) > most_faces and cells > 8:
+    while len(model.faces) > max_faces and cells > 8:
         model, cells = _clustered(model, cells), cells // 2
     return model
 
@@ -107,26 +114,26 @@ def _clustered(model: ObjectModel, cells: int) -> ObjectModel:
     keys = np.column_stack((np.floor((model.vertices_m - model.vertices_m.min(axis=0)) / size), model.part))
     first, cell = distinct_rows(keys)
     faces = cell[model.faces]
-    apart = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    return ObjectModel(model.name, model.vertices_m[first], faces[apart], model.part[first], model.hinge)
+    has_area = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    return ObjectModel(model.name, model.vertices_m[first], faces[has_area], part=model.part[first], hinge=model.hinge)
 
 
 def read_mesh_file(path: Path) -> Mesh:
-    """Vertices and triangles of an OBJ, PLY, STL or GLB file in its own unit and axes.
+    """Read vertices and triangles of an OBJ, PLY, STL or GLB file, in the file's unit and axes.
 
-    Of STL and GLB, vertices in the same place become one; a GLB's nodes stand where its scene puts them.
-    Raises BadInput for a file that holds no finite triangle mesh.
+    Coinciding vertices of STL and GLB are merged. The nodes of a GLB are in the frame of its scene.
+
+    Raises:
+        BadInput: the file holds no finite triangle mesh.
     """
     return _joined(_read(path))
 
 
 class _MeshFile(NamedTuple):
-    """mesh: as stored. source: (vertex,) of STL and GLB which solid or node it belongs to; None of OBJ and PLY, whose
-    faces share vertices. pieces: the divisions that the file names.
-    """
+    """A mesh with the divisions that its file names."""
 
-    mesh: Mesh
-    source: np.ndarray | None
+    mesh: Mesh  # as stored
+    source: np.ndarray | None  # (vertex,) index of its solid (STL) or node (GLB); None for OBJ and PLY
     pieces: list[NamedPieces]
 
 
@@ -163,71 +170,75 @@ def _of_glb(glb: Glb) -> tuple[Mesh, list[NamedPieces]]:
 
 
 def _joined(file: _MeshFile) -> Mesh:
-    """The mesh with the vertices of STL and GLB merged where they coincide; those that no face uses are dropped."""
+    """Merge coinciding vertices of STL and GLB, and drop their unused vertices."""
     if file.source is None:
         return file.mesh
     used, corner = np.unique(file.mesh.faces, return_inverse=True)
-    first, number = distinct_rows(np.round(file.mesh.vertices[used] * MERGED_PER_UNIT))
+    first, number = distinct_rows(np.round(file.mesh.vertices[used] * MERGE_PRECISION))
     return Mesh(file.mesh.vertices[used[first]], number[corner].reshape(-1, 3))
 
 
 def _in_two_pieces(path: Path, file: _MeshFile) -> tuple[Mesh, np.ndarray, tuple[str, str]]:
-    """The mesh, (vertex,) 1 for the second of its two pieces in the order of the file, and the names of the pieces.
+    """Divide a mesh into two pieces, in the order of the file. Vertices that both pieces use are duplicated.
 
-    Vertices that both pieces use are doubled. Raises BadInput where no division of the file gives two pieces.
+    Returns:
+        The mesh, (vertex,) 1 for vertices of the second piece, and the names of the pieces.
+
+    Raises:
+        BadInput: no division of the file has two pieces.
     """
     divisions = _divisions(file)
-    two = _first_of_two(divisions)
-    if two is None:
-        counts = dict.fromkeys((own.kind, len(_order(own))) for own in divisions)
+    pieces = _division_into_two(divisions)
+    if pieces is None:
+        counts = dict.fromkeys((division.kind, len(_order(division))) for division in divisions)
         got = ", ".join(f"{count} {kind}" for kind, count in counts if count > 1) or "one shell"
         remedy = "export a base and what moves as two objects or nodes; each may have any number of shells"
         raise BadInput(path, "two separate pieces for --hinge", got, remedy)
-    moves = two.of_face == _order(two)[1]
+    moves = pieces.of_face == _order(pieces)[1]
     faces = file.mesh.faces
-    key, place, number = np.unique(
-        2 * _own_vertices(file)[faces] + moves[:, None], return_index=True, return_inverse=True
+    key, first_use, number = np.unique(
+        2 * _merged_within_source(file)[faces] + moves[:, None], return_index=True, return_inverse=True
     )
-    mesh = Mesh(file.mesh.vertices[faces.ravel()[place]], number.reshape(-1, 3))
-    return mesh, (key % 2).astype(np.uint8), _names(two)
+    mesh = Mesh(file.mesh.vertices[faces.ravel()[first_use]], number.reshape(-1, 3))
+    return mesh, (key % 2).astype(np.uint8), _names(pieces)
 
 
 def two_pieces(path: Path) -> tuple[str, str] | None:
-    """The names of the two pieces of which ``--hinge`` turns the second ("" where unnamed); None of any other mesh."""
-    two = _first_of_two(_divisions(_read(path)))
-    return None if two is None else _names(two)
+    """Names of the two pieces of which ``--hinge`` rotates the second ("" if unnamed); None for any other mesh."""
+    pieces = _division_into_two(_divisions(_read(path)))
+    return None if pieces is None else _names(pieces)
 
 
-def _first_of_two(divisions: list[NamedPieces]) -> NamedPieces | None:
-    return next((own for own in divisions if len(_order(own)) == 2), None)
+def _division_into_two(divisions: list[NamedPieces]) -> NamedPieces | None:
+    return next((division for division in divisions if len(_order(division)) == 2), None)
 
 
-def _names(two: NamedPieces) -> tuple[str, str]:
-    first, second = _order(two)
-    return (two.names[first], two.names[second]) if two.names else ("", "")
+def _names(pieces: NamedPieces) -> tuple[str, str]:
+    first, second = _order(pieces)
+    return (pieces.names[first], pieces.names[second]) if pieces.names else ("", "")
 
 
 def _order(pieces: NamedPieces) -> list[int]:
-    """The numbers of the pieces in the order of the file."""
+    """Indices of the pieces in the order of the file."""
     numbers, first = np.unique(pieces.of_face, return_index=True)
     return numbers[np.argsort(first)].tolist()
 
 
 def _divisions(file: _MeshFile) -> list[NamedPieces]:
-    """The ways to divide a mesh into pieces, the most telling first: what the file names, then its shells.
+    """All divisions of a mesh into pieces, the most meaningful first: named pieces, then shells.
 
-    A shell is what shares vertices. Vertices are joined where they coincide, as many files repeat them along seams; if
-    that makes one piece of all, as of a lid that lies on its box, only those that the file itself has as one.
+    A shell is a set of triangles connected by vertices. The first count of shells merges coinciding vertices, because
+    files often repeat vertices along seams. That also joins a closed lid to its box, so the second count does not.
     """
-    coinciding = distinct_rows(np.round(file.mesh.vertices * MERGED_PER_UNIT)).number
-    return [*file.pieces, *(_shells(file.mesh.faces, own) for own in (coinciding, _own_vertices(file)))]
+    coinciding = distinct_rows(np.round(file.mesh.vertices * MERGE_PRECISION)).number
+    return [*file.pieces, *(_shells(file.mesh.faces, same) for same in (coinciding, _merged_within_source(file)))]
 
 
-def _own_vertices(file: _MeshFile) -> np.ndarray:
-    """(vertex,) equal for vertices that the file has as one: in STL and GLB, those of a solid or node that coincide."""
+def _merged_within_source(file: _MeshFile) -> np.ndarray:
+    """(vertex,) label, equal for the same vertex; in STL and GLB, for coinciding vertices of one solid or node."""
     if file.source is None:
         return np.arange(len(file.mesh.vertices))
-    return distinct_rows(np.column_stack((np.round(file.mesh.vertices * MERGED_PER_UNIT), file.source))).number
+    return distinct_rows(np.column_stack((np.round(file.mesh.vertices * MERGE_PRECISION), file.source))).number
 
 
 def _is_gltf(path: Path) -> bool:
@@ -235,39 +246,41 @@ def _is_gltf(path: Path) -> bool:
 
 
 def _scale(path: Path, mesh: Mesh, unit: str) -> float:
-    """Metres per unit of the file."""
+    """Metres per unit of the file, after a check of the mesh's size."""
     if unit and unit not in UNITS_M:
         raise BadInput("--unit", f"one of {', '.join(UNITS_M)}", unit, "name the unit of the file's numbers")
     longest = float(np.ptp(mesh.vertices, axis=0).max())
-    metres = longest * UNITS_M[unit or "m"]
-    if SMALLEST_M <= metres <= LARGEST_M:
+    longest_m = longest * UNITS_M[unit or "m"]
+    if SMALLEST_M <= longest_m <= LARGEST_M:
         return UNITS_M[unit or "m"]
     likely = [
-        f"--unit {name} makes it {_size(longest * factor)}"
+        f"--unit {name} makes it {_centimetres(longest * factor)}"
         for name, factor in UNITS_M.items()
-        if name != (unit or "m") and HELD_M[0] <= longest * factor <= HELD_M[1]
+        if name != (unit or "m") and GRASPABLE_M[0] <= longest * factor <= GRASPABLE_M[1]
     ]
     expected = f"a longest side of {SMALLEST_M:g} to {LARGEST_M:g} m"
-    raise BadInput(path, expected, f"{metres:.4g} m in {unit or 'm'}", "; ".join(likely) or "scale the mesh to metres")
+    raise BadInput(
+        path, expected, f"{longest_m:.4g} m in {unit or 'm'}", "; ".join(likely) or "scale the mesh to metres"
+    )
 
 
-def _size(metres: float) -> str:
+def _centimetres(metres: float) -> str:
     return f"{metres * 100:.3g} cm"
 
 
 def _upright_from_file(up: np.ndarray) -> np.ndarray:
-    """(3, 3) turn that takes ``up`` to +z: about x for y, about y for x, so that the other axes stay axes."""
+    """(3, 3) rotation that takes the axis ``up`` to +z, about x for y and about y for x."""
     if up[2]:
         return np.diag([1.0, up[2], up[2]])
     along = int(np.flatnonzero(up)[0])
-    turn = np.zeros((3, 3))
-    turn[2, along] = up[along]
-    turn[along, 2] = -up[along]
-    turn[1 - along, 1 - along] = 1.0
-    return turn
+    rotation = np.zeros((3, 3))
+    rotation[2, along] = up[along]
+    rotation[along, 2] = -up[along]
+    rotation[1 - along, 1 - along] = 1.0
+    return rotation
 
 
-def _hinge(text: str, scale: float, turn: np.ndarray) -> Hinge:
+def _hinge(text: str, scale: float, upright_from_file: np.ndarray) -> Hinge:
     try:
         point, direction = (np.array([float(number) for number in word.split(",")]) for word in text.split())
         if point.shape != (3,) or direction.shape != (3,) or not np.isfinite([point, direction]).all():
@@ -278,11 +291,11 @@ def _hinge(text: str, scale: float, turn: np.ndarray) -> Hinge:
     except ValueError as error:
         remedy = 'write a point on the axis, then its direction, like "0,0.1,0.05 1,0,0"'
         raise BadInput("--hinge", "two times three numbers", text[:80], remedy) from error
-    return Hinge(turn @ direction / length, turn @ point * scale)
+    return Hinge(upright_from_file @ direction / length, upright_from_file @ point * scale)
 
 
 def _shells(faces: np.ndarray, same: np.ndarray) -> NamedPieces:
-    """The connected components of a mesh. same: (vertex,), equal for vertices that are one."""
+    """The connected components of a mesh; ``same`` (vertex,) is equal for merged vertices."""
     faces, count = same[faces], int(same.max()) + 1
     rows, columns = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
@@ -290,7 +303,7 @@ def _shells(faces: np.ndarray, same: np.ndarray) -> NamedPieces:
 
 
 def _hull_area(points: np.ndarray) -> float:
-    """Area of the convex hull of points (n, 2); 0 where they span none."""
+    """Area of the convex hull of points (n, 2); 0 for collinear points."""
     try:
         return float(ConvexHull(points).volume) if len(points) > 2 else 0.0
     except QhullError:

@@ -1,8 +1,8 @@
-"""Can frictional contacts produce the motion an object shows? Inverse dynamics as ManipNet's Appendix A, in SI units.
+"""Inverse dynamics: can frictional contacts explain an object's motion? ManipNet's Appendix A in SI units.
 
-Each contact pushes within its friction cone, here the four edges ``-n +- mu t``. Non-negative multiples of all edges
-must add up to the wrench the motion needs, ``[m (a - g); dL/dt]`` about the centre of mass. What is left over,
-in N and N m, is the residual; a frame below ``RESIDUAL_LIMIT`` is feasible.
+Each contact force is in a friction cone, approximated by the four edges ``-n +- mu t``. Non-negative multiples of all
+edges must sum to the wrench of the motion, ``[m (a - g); dL/dt]`` about the centre of mass. The residual is the norm of
+the difference, in N and N m. A frame is feasible if its residual is below ``RESIDUAL_LIMIT``.
 """
 
 from typing import NamedTuple
@@ -23,43 +23,40 @@ _NNLS_ITERATIONS = 300
 
 
 class BodyMotion(NamedTuple):
-    """Motion of a body of 1 kg, world frame, one row per frame.
+    """Motion of a body of 1 kg in the world frame."""
 
-    centre_m: (frame, 3) centre of mass. inertia_kg_m2: (frame, 3, 3) about it, world axes.
-    rotmats: (frame, 3, 3) world-from-object.
-    """
-
-    centre_m: np.ndarray
-    inertia_kg_m2: np.ndarray
-    rotmats: np.ndarray
+    centre_m: np.ndarray  # (frame, 3) centre of mass
+    inertia_kg_m2: np.ndarray  # (frame, 3, 3) about the centre of mass, world axes
+    rotmats: np.ndarray  # (frame, 3, 3) world_from_object
 
 
 class Contacts(NamedTuple):
-    """points_m, normals: (contact, 3), object frame; normals point out of the object."""
+    """Contact points on an object, in the object frame."""
 
-    points_m: np.ndarray
-    normals: np.ndarray
+    points_m: np.ndarray  # (contact, 3)
+    normals: np.ndarray  # (contact, 3) unit, outward
 
 
 def body_motion(
     model: ObjectModel, rotmats: np.ndarray, translation_m: np.ndarray, hinge_rad: np.ndarray | None
 ) -> BodyMotion:
-    """Centre of mass and inertia of 1 kg in the world at each frame; a hinged object is one body at its angle."""
+    """Centre of mass and inertia of an object of 1 kg in each frame; a hinged object is one body at its angle."""
     n_frames = len(rotmats)
     parts = model.masses
     total = sum(part.volume_m3 for part in parts)
-    shares, centres, inertias = [part.volume_m3 / total for part in parts], [], []
+    mass_fractions, centres, inertias = [part.volume_m3 / total for part in parts], [], []
     for index, part in enumerate(parts):
         object_from_part = model.object_from_part(index, hinge_rad)
-        turn = np.broadcast_to(object_from_part.rotation, (n_frames, 3, 3))
+        part_rotation = np.broadcast_to(object_from_part.rotation, (n_frames, 3, 3))
         centres.append((object_from_part @ np.broadcast_to(part.centre_m, (n_frames, 1, 3)))[:, 0])
-        inertias.append(turn @ part.inertia_kg_m2 @ turn.transpose(0, 2, 1))
-    centre = sum(share * c for share, c in zip(shares, centres, strict=True))
+        inertias.append(part_rotation @ part.inertia_kg_m2 @ part_rotation.transpose(0, 2, 1))
+    centre = sum(mass_fraction * c for mass_fraction, c in zip(mass_fractions, centres, strict=True))
     inertia = np.zeros((n_frames, 3, 3))
-    for share, part_centre, part_inertia in zip(shares, centres, inertias, strict=True):
-        away = part_centre - centre
-        square = (away**2).sum(-1)[:, None, None] * np.eye(3)
-        inertia += share * (part_inertia + square - away[:, :, None] * away[:, None, :])
+    for mass_fraction, part_centre, part_inertia in zip(mass_fractions, centres, inertias, strict=True):
+        offset = part_centre - centre
+        # Parallel axis theorem: shift the inertia of the part to the common centre of mass.
+        squared_offset = (offset**2).sum(-1)[:, None, None] * np.eye(3)
+        inertia += mass_fraction * (part_inertia + squared_offset - offset[:, :, None] * offset[:, None, :])
     world_centre = np.einsum("fij,fj->fi", rotmats, np.asarray(centre)) + translation_m
     return BodyMotion(world_centre, rotmats @ inertia @ rotmats.transpose(0, 2, 1), rotmats)
 
@@ -74,9 +71,15 @@ def angular_velocity(rotmats: np.ndarray, fps: float) -> np.ndarray:
 
 
 def required_wrench(motion: BodyMotion, fps: float, gravity: np.ndarray) -> np.ndarray:
-    """(frame, 6): force in N and torque in N m about the centre of mass that the contacts of 1 kg must apply.
+    """Wrench that contacts must apply to a body of 1 kg, by central differences over frames.
 
-    gravity: (3,) unit vector, the direction things fall. Derivatives are central differences over frames.
+    Args:
+        motion: of the body.
+        fps: frames per second.
+        gravity: (3,) unit vector, downwards.
+
+    Returns:
+        (frame, 6) force in N and torque in N m about the centre of mass.
     """
     if len(motion.centre_m) < 3:
         raise ValueError(f"a motion of at least 3 frames is needed for accelerations, got {len(motion.centre_m)}")
@@ -91,13 +94,13 @@ def required_wrench(motion: BodyMotion, fps: float, gravity: np.ndarray) -> np.n
 
 
 def hand_patches(model: HandModel) -> np.ndarray:
-    """(778,) which of 21 patches a hand vertex belongs to: 15 finger segments, then 6 regions of the palm.
+    """(778,) patch of each hand vertex, 0 to 20: 15 finger segments, then 6 regions of the palm.
 
-    As ManipNet's capsules (Appendix A): 4 palm regions towards the fingers, the thumb's ball and the heel.
+    As in ManipNet's capsules (Appendix A), the palm has 4 regions towards the fingers, the thumb's ball and the heel.
     """
     joint = model.skin_weights.argmax(axis=1)
     rest = model.joint_regressor @ model.template_m
-    knuckles = rest[[1, 4, 10, 7]]
+    knuckles = rest[[1, 4, 10, 7]]  # index, middle, ring, pinky
     anchors = np.concatenate(
         [rest[0] + 0.7 * (knuckles - rest[0]), [0.5 * (rest[0] + rest[13])], [rest[0] + 0.25 * (rest[7] - rest[0])]]
     )
@@ -106,11 +109,17 @@ def hand_patches(model: HandModel) -> np.ndarray:
 
 
 def patch_contacts(distances: SignedDistance, patches: np.ndarray, frame: int) -> Contacts:
-    """At most one contact per patch: its deepest vertex, where that is nearer than 2 mm.
+    """Contacts of one frame: of each patch, the deepest vertex if it is within 2 mm of the surface.
 
-    The contact point is the closest surface point. distances: of points (frame, point), object frame, as
-    ``SurfaceIndex.nearest`` gives them. patches: (point,) as from :func:`hand_patches`, any numbering.
+    Args:
+        distances: of points (frame, point), object frame, from ``SurfaceIndex.nearest``.
+        patches: (point,) labels, such as those of :func:`hand_patches`.
+        frame: index of the frame.
+
+    Returns:
+        The closest surface points and their normals.
     """
+    # Sorted by distance, the first vertex of each patch is the deepest.
     order = np.argsort(distances.distance_m[frame], kind="stable")
     order = order[distances.distance_m[frame][order] < CONTACT_TOLERANCE_M]
     first = np.unique(patches[order], return_index=True)[1]
@@ -119,7 +128,8 @@ def patch_contacts(distances: SignedDistance, patches: np.ndarray, frame: int) -
 
 
 def cone_edges(normals: np.ndarray, friction: float = FRICTION) -> np.ndarray:
-    """(contact, 4, 3) edges ``-n +- mu t`` of the friction cones; normals (contact, 3) point out of the object."""
+    """(contact, 4, 3) edges ``-n +- mu t`` of the friction cones; outward normals (contact, 3)."""
+    # A vector that is not parallel to the normal.
     helper = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     first = np.cross(normals, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -131,7 +141,7 @@ def cone_edges(normals: np.ndarray, friction: float = FRICTION) -> np.ndarray:
 def wrench_columns(
     points_m: np.ndarray, normals: np.ndarray, centre_m: np.ndarray, friction: float = FRICTION
 ) -> np.ndarray:
-    """(6, 4 x contact): the wrench about ``centre_m`` of a unit multiple of each cone edge."""
+    """(6, 4 x contact) wrench about ``centre_m`` of a unit multiple of each cone edge."""
     edges = cone_edges(normals, friction)
     torques = np.cross((points_m - centre_m)[:, None], edges)
     return np.concatenate([edges, torques], axis=2).reshape(-1, 6).T
@@ -140,11 +150,11 @@ def wrench_columns(
 def force_residual(
     points_m: np.ndarray, normals: np.ndarray, centre_m: np.ndarray, wrench: np.ndarray, friction: float = FRICTION
 ) -> float:
-    """Residual in N and N m of contacts at ``points_m (contact, 3)`` against the required ``wrench (6,)``."""
+    """Residual in N and N m of contacts at ``points_m`` (contact, 3) for the required ``wrench`` (6,)."""
     if not len(points_m):
         return float(np.linalg.norm(wrench))
     try:
         columns = wrench_columns(points_m, normals, centre_m, friction)
         return float(nnls(columns, wrench, maxiter=_NNLS_ITERATIONS)[1])
-    except RuntimeError:  # no convergence: counted as infeasible, never as feasible
+    except RuntimeError:  # no convergence: never count as feasible
         return float("inf")

@@ -1,1 +1,1 @@
-"""Exact contact of hand and object surface: touched vertices, depth, shared volume, BimArt's maps."""
+"""Exact contact of a hand with an object's surface: touched vertices, penetration depth, overlap, BimArt's maps."""

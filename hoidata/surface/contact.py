@@ -1,7 +1,7 @@
-"""Hands of a clip against the exact surface of its object: touched vertices, penetration.
+"""Contact of a clip's hands with the exact surface of its object: touched vertices and penetration depth.
 
-Everything is asked in the object frame, so no answer depends on the world a clip is in. Arrays have a row for every
-frame of the clip; frames in which the hand is not valid are not looked at.
+Queries are in the object frame, so results do not depend on the clip's world frame. Result arrays cover all frames of
+the clip; frames with an invalid hand have a fill value.
 """
 
 from dataclasses import dataclass
@@ -12,28 +12,24 @@ from hoidata.clips.clip import Clip, Side
 from hoidata.hands import HandPair, track_vertices
 from hoidata.objects.surface_index import SurfaceIndex
 
-TOUCH_M = 0.005
+TOUCH_M = 0.005  # distance below which a vertex touches the surface
 
 
 @dataclass(frozen=True)
 class PlacedHand:
-    """One hand of a clip as its object sees it.
+    """One hand of a clip in the object frame, in the frames in which it is valid."""
 
-    vertices_m: (valid frame, 778, 3) float64, object frame. frames: (valid frame,) their numbers in the clip;
-    hinge_rad: (valid frame,) or None. faces: (face, 3). n_frames: of the clip.
-    """
-
-    vertices_m: np.ndarray
-    frames: np.ndarray
-    hinge_rad: np.ndarray | None
-    faces: np.ndarray
-    n_frames: int
+    vertices_m: np.ndarray  # (valid frame, 778, 3) float64, object frame
+    frames: np.ndarray  # (valid frame,) indices in the clip
+    hinge_rad: np.ndarray | None  # (valid frame,)
+    faces: np.ndarray  # (face, 3)
+    n_frames: int  # of the clip
 
     def over_clip(self, values: np.ndarray, elsewhere: float | bool) -> np.ndarray:
-        """Values of the valid frames (valid frame, ...) with a row for every frame of the clip."""
-        rows = np.full((self.n_frames, *values.shape[1:]), elsewhere, values.dtype)
-        rows[self.frames] = values
-        return rows
+        """Expand values (valid frame, ...) to all frames of the clip, with ``elsewhere`` in the others."""
+        over_frames = np.full((self.n_frames, *values.shape[1:]), elsewhere, values.dtype)
+        over_frames[self.frames] = values
+        return over_frames
 
 
 def placed_hand(clip: Clip, side: Side, hands: HandPair) -> PlacedHand:
@@ -41,17 +37,19 @@ def placed_hand(clip: Clip, side: Side, hands: HandPair) -> PlacedHand:
     track, frames = clip.object, np.flatnonzero(clip.hands[side].valid)
     vertices = track.world_from_object.inverse() @ track_vertices(clip.hands[side], hands[side]).astype(np.float64)
     hinge = None if track.hinge_rad is None else track.hinge_rad[frames]
-    return PlacedHand(vertices[frames], frames, hinge, hands[side].faces, clip.n_frames)
+    return PlacedHand(
+        vertices_m=vertices[frames], frames=frames, hinge_rad=hinge, faces=hands[side].faces, n_frames=clip.n_frames
+    )
 
 
 def touched_vertices(hand: PlacedHand, index: SurfaceIndex, threshold_m: float = TOUCH_M) -> np.ndarray:
-    """(frame, 778) bool: the vertex is closer than ``threshold_m`` to the surface; False in frames without the hand."""
+    """(frame, 778) bool: vertices closer than ``threshold_m`` to the surface; False in frames without the hand."""
     return hand.over_clip(index.within(hand.vertices_m, hand.hinge_rad, threshold_m), False)
 
 
 def deepest_m(hand: PlacedHand, index: SurfaceIndex) -> np.ndarray:
-    """(frame,) metres the deepest vertex is inside the solid, 0 where none is, NaN in frames without the hand.
+    """(frame,) penetration depth of the deepest vertex in metres, 0 without one, NaN in frames without the hand.
 
-    Raises BadInput for an object without an inside; ``index.solid_note`` says what was repaired or left out.
+    Raises BadInput for an object without an inside. ``index.solid_note`` has its repairs.
     """
     return hand.over_clip(index.depth_m(hand.vertices_m, hand.hinge_rad).max(axis=1), np.nan)

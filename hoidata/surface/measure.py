@@ -1,4 +1,4 @@
-"""One hand of one clip against the exact surface of its object: contact, depth, nearest joint and BimArt's map."""
+"""Measures one hand of a clip against the surface of its object: contact, depth, nearest joint, BimArt's map."""
 
 from typing import NamedTuple
 
@@ -13,24 +13,25 @@ from hoidata.surface.contact import deepest_m, placed_hand, touched_vertices
 
 
 class SideSurface(NamedTuple):
-    """What the surface of the object says of one hand, per frame.
+    """Measures of one hand in each frame."""
 
-    touched: (frame, 778) bool, the vertex is closer than 5 mm to the surface; False in frames without the hand.
-    depth_m: (frame,) the deepest vertex inside the object; NaN without the hand, or where nothing can be inside.
-    joint_m: (frame,) distance of the nearest of 21 joints to the surface; infinite without the hand.
-    map_m: (frame, point) BimArt's map; infinite without the hand and beyond 20 cm.
-    """
-
-    touched: np.ndarray
-    depth_m: np.ndarray
-    joint_m: np.ndarray
-    map_m: np.ndarray
+    touched: np.ndarray  # (frame, 778) bool, vertices closer than 5 mm to the surface; False without the hand
+    depth_m: np.ndarray  # (frame,) penetration of the deepest vertex; NaN without the hand or for an open object
+    joint_m: np.ndarray  # (frame,) distance of the nearest of 21 joints to the surface; infinite without the hand
+    map_m: np.ndarray  # (frame, point) BimArt's map; infinite without the hand and beyond 20 cm
 
 
 def measure_hand(clip: Clip, side: Side, hands: HandPair, points: SampledPoints) -> SideSurface:
-    """One hand of a clip against its object's surface. hands: the model of the clip's hands. points: of its object.
+    """Measure one hand of a clip against its object's surface.
 
-    Raises BadInput for a mesh without a surface.
+    Args:
+        clip: the clip.
+        side: of the hand.
+        hands: the model of the clip's hands.
+        points: sampled points of the object.
+
+    Raises:
+        BadInput: the mesh has no triangles.
     """
     index, hand = surface_index(clip.object.model), placed_hand(clip, side, hands)
     joints_m = track_joints(clip.hands[side], hands[side]).astype(np.float64)

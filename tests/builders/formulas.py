@@ -22,33 +22,33 @@ def rest_points(model: HandModel, betas=None, template_m=None) -> np.ndarray:
 
 def chain(rest: np.ndarray, orient, fingers, transl) -> np.ndarray:
     """(16, 3) joints of a bent hand, bone by bone; fingers: 45 absolute axis-angle numbers."""
-    turns = [Rotation.from_rotvec(turn) for turn in np.concatenate((orient, fingers)).reshape(16, 3)]
-    places, totals = [rest[0] + np.asarray(transl)], [turns[0]]
+    rotations = [Rotation.from_rotvec(rotvec) for rotvec in np.concatenate((orient, fingers)).reshape(16, 3)]
+    positions, totals = [rest[0] + np.asarray(transl)], [rotations[0]]
     for joint in range(1, 16):
         parent = PARENT[joint]
-        places.append(places[parent] + totals[parent].apply(rest[joint] - rest[parent]))
-        totals.append(totals[parent] * turns[joint])
-    return np.array(places)
+        positions.append(positions[parent] + totals[parent].apply(rest[joint] - rest[parent]))
+        totals.append(totals[parent] * rotations[joint])
+    return np.array(positions)
 
 
 def joints_as_stored(track: HandTrack, model: HandModel, frame: int) -> np.ndarray:
-    """(16, 3) joints of one frame from what a clip says: wrist, turn, bends, mesh, betas."""
+    """(16, 3) joints of one frame from the stored wrist, orientation, finger pose, mesh and betas."""
     betas = track.betas[0 if len(track.betas) == 1 else frame].astype(np.float64)
     rest = rest_points(model, betas, track.template_m)
     wrist_m = track.wrist_m[frame].astype(np.float64)
     return chain(rest, track.global_orient[frame], track.hand_pose[frame].astype(np.float64), wrist_m - rest[0])
 
 
-def off_m(found, other) -> float:
-    """How far the farthest of some points is from its like."""
-    return float(np.linalg.norm(np.asarray(found) - np.asarray(other), axis=-1).max())
+def off_m(actual, other) -> float:
+    """Largest distance between corresponding points."""
+    return float(np.linalg.norm(np.asarray(actual) - np.asarray(other), axis=-1).max())
 
 
-def agrees(found, expected, *wrongs) -> None:
-    """Points are where one convention puts them, and more than 5 mm from where others do."""
-    assert off_m(found, expected) < EXACT_M
+def agrees(actual, expected, *wrongs) -> None:
+    """Check that points agree with one convention and are more than 5 mm from the results of others."""
+    assert off_m(actual, expected) < EXACT_M
     for wrong in wrongs:
-        assert off_m(found, wrong) > WRONG_M
+        assert off_m(actual, wrong) > WRONG_M
 
 
 # A person who sits at a table, looks along +y and has z up: palms down, fingers ahead, thumbs towards each other. At
@@ -58,41 +58,44 @@ THIRD_TURN = 2 * np.pi / 3 / np.sqrt(3)
 ORIENT = {"left": np.array([1.0, 1.0, 1.0]) * THIRD_TURN, "right": np.array([1.0, -1.0, -1.0]) * THIRD_TURN}
 TRANSL = {"left": (-0.25, 0.05, 0.8), "right": (0.25, 0.02, 0.82)}
 BEND = {"left": -0.6, "right": 0.6}
-HALF_TURN = np.array([0.0, 0.0, np.pi])  # the same read by rows or by columns
+HALF_TURN = np.array([0.0, 0.0, np.pi])  # equal for row and column vectors
 AHEAD, TO_THE_RIGHT, UP = np.eye(3)[[1, 0, 2]]
 FINGERS_THUMB_PALM = {"left": (AHEAD, TO_THE_RIGHT, -UP), "right": (AHEAD, -TO_THE_RIGHT, -UP)}
 
 
 def seated_person(mirrored: int | None = None, swapped: bool = False) -> SimpleNamespace:
-    """Her numbers: for each hand (orient, 45 finger angles, transl), and those of a thing turned by half a turn.
+    """Parameters of a seated person's hands (orient, 45 finger angles, transl) and of an object rotated by pi.
 
-    mirrored: the axis whose sign a reader of the wrong handedness takes for the opposite (``signs`` for points; a
-    rotation vector w becomes -M w). swapped: each side's numbers under the other side's name.
+    Args:
+        mirrored: the axis that a reader of the wrong handedness mirrors: ``signs`` for points; a rotation vector w
+            becomes -M w.
+        swapped: exchange the parameters of left and right.
     """
     signs = np.where(np.arange(3) == mirrored, -1.0, 1.0)
-    turn = -signs if mirrored is not None else signs
+    mirror_signs = -signs if mirrored is not None else signs
     other = {"left": "right", "right": "left"} if swapped else {"left": "left", "right": "right"}
     fingers = {side: np.concatenate((np.tile((0.0, 0.0, bend), 12), np.zeros(9))) for side, bend in BEND.items()}
-    hands = {side: (ORIENT[of] * turn, fingers[of], TRANSL[of] * signs) for side, of in other.items()}
-    return SimpleNamespace(hands=hands, named=other, signs=signs, object_orient=HALF_TURN * turn)
+    hands = {side: (ORIENT[of] * mirror_signs, fingers[of], TRANSL[of] * signs) for side, of in other.items()}
+    return SimpleNamespace(hands=hands, named=other, signs=signs, object_orient=HALF_TURN * mirror_signs)
 
 
 def hand_axes(joints: np.ndarray) -> np.ndarray:
-    """Unit rows of (16, 3) joints of a bent hand: along the fingers, to the thumb's side, where the fingers bend to."""
+    """Unit axes of a bent hand with (16, 3) joints: along the fingers, to the thumb's side, bending direction."""
     fingers = joints[4] - joints[0]
     thumb, palm = joints[13] - joints[7], joints[6] - joints[5]
-    axes = [fingers, *(way - fingers * (way @ fingers) / (fingers @ fingers) for way in (thumb, palm))]
+    across = [side - fingers * (side @ fingers) / (fingers @ fingers) for side in (thumb, palm)]
+    axes = [fingers, *across]
     return np.array(axes) / np.linalg.norm(axes, axis=1, keepdims=True)
 
 
 def has_its_own_side(joints: dict[str, np.ndarray]) -> bool:
-    """Fingers ahead, thumb to the right, palm down: a left hand, whose three directions turn as x, y, z do."""
+    """Whether both hands have the correct handedness: a left hand's axes are right-handed."""
     return all(np.linalg.det(hand_axes(joints[side])) * sign > 0.9 for side, sign in (("left", 1), ("right", -1)))
 
 
 def sits_as_described(joints: dict[str, np.ndarray], edges: np.ndarray, edges_seen: np.ndarray) -> bool:
-    """The right hand on her right, both as described, and the thing's edges where she sees them."""
+    """Whether the right hand is on the person's right, and hand axes and object edges are as expected."""
     pairs = [(hand_axes(joints[side]), FINGERS_THUMB_PALM[side]) for side in joints] + [(edges, edges_seen)]
-    cosines = [np.sum(found * seen, axis=1) / np.linalg.norm(found, axis=1) for found, seen in pairs]
+    cosines = [np.sum(actual * expected, axis=1) / np.linalg.norm(actual, axis=1) for actual, expected in pairs]
     right_of_left = (joints["right"][0] - joints["left"][0]) @ TO_THE_RIGHT
     return bool(right_of_left > 0.3 and min(cosine.min() for cosine in cosines) > 0.9)

@@ -1,4 +1,4 @@
-"""Objects of tests: boxes, whatever trimesh makes, two parts on a hinge, clouds of points."""
+"""Builders of test objects: boxes, trimesh meshes, hinged parts, point clouds."""
 
 from typing import Any
 
@@ -36,27 +36,32 @@ def two_parts(
         name,
         np.concatenate([base.vertices_m, lid.vertices_m]),
         np.concatenate([base.faces, lid.faces + n_base]),
-        np.repeat(np.array([0, 1], np.uint8), [n_base, len(lid.vertices_m)]),
-        Hinge(np.array(axis, np.float64), np.array(origin_m, np.float64)),
+        part=np.repeat(np.array([0, 1], np.uint8), [n_base, len(lid.vertices_m)]),
+        hinge=Hinge(np.array(axis, np.float64), np.array(origin_m, np.float64)),
     )
 
 
 def hinged_box() -> ObjectModel:
-    """The box of ``box_model`` with a lid of 1 cm on its -y side that turns about an edge along x."""
+    """The box of ``box_model`` with a lid of 1 cm on its -y side that rotates about an edge along x."""
     lid = box_model((0.10, 0.01, 0.06), middle_m=(0, -0.045, 0))
     return two_parts(box_model(), lid, (1, 0, 0), (0, -0.04, -0.03), "hinged_box")
 
 
 def notebook(thickness_m: float = 0.01) -> ObjectModel:
-    """Two plates of 10 x 10 cm side by side; the second turns about the edge between them, along y."""
+    """Two plates of 10 x 10 cm side by side; the second rotates about the edge between them, along y."""
     base, lid = (box_model((0.1, 0.1, thickness_m), middle_m=(x, 0, 0)) for x in (-0.05, 0.05))
     return two_parts(base, lid, (0, 1, 0), name="notebook")
 
 
 def sampled(points_m: np.ndarray, part: np.ndarray | None = None) -> SampledPoints:
-    """Points as sampling gives them, without normals or faces."""
+    """Sampled points without normals or faces."""
     count, nothing = len(points_m), np.zeros((len(points_m), 3), np.float32)
     part = np.zeros(count, np.uint8) if part is None else part
     return SampledPoints(
-        np.asarray(points_m, np.float32), nothing, np.zeros(count, np.int32), nothing, part, "surface-fps"
+        points_m=np.asarray(points_m, np.float32),
+        normals=nothing,
+        face=np.zeros(count, np.int32),
+        barycentric=nothing,
+        part=part,
+        method="surface-fps",
     )

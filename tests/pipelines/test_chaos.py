@@ -22,7 +22,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hoidata.errors import BadInput, MachineTrouble, told_in_words
-from hoidata.files.written import ask_digests_of
+from hoidata.files.written import verify_with
 from pipelines.cli import app
 from pipelines.lineage.locks import dvc_digest, written_digest
 from pipelines.side_by_side import log_of
@@ -331,7 +331,7 @@ def test_one_changed_byte_is_named_by_validate_and_check_and_no_reader_shows_it(
     path = built / name
     whole = path.read_bytes()
     path.write_bytes(flipped(whole, turn))
-    ask_digests_of(written_digest)
+    verify_with(written_digest)
     try:
         for words in (["validate", str(path.parent)], ["lineage", "check", str(path)]):
             done = CliRunner().invoke(app, words, env={"COLUMNS": "400"})
@@ -348,7 +348,7 @@ def test_one_changed_byte_is_named_by_validate_and_check_and_no_reader_shows_it(
             with pytest.raises(BadInput, match="checksum"):
                 store.clip(store.ids[0])
     finally:
-        ask_digests_of(lambda path: None)
+        verify_with(lambda path: None)
         path.write_bytes(whole)
 
 

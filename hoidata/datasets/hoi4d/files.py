@@ -221,7 +221,7 @@ def hand_frame(data: bytes, path: str) -> HandFrame:
     """Read one frame of one hand from a pickle of Python 2."""
     if len(data) > MAX_HAND_BYTES:
         raise BadInput(path, f"at most {MAX_HAND_BYTES} bytes", f"{len(data)}")
-    value = restricted_load(data, ARRAYS, encoding="latin1", where=path)
+    value = restricted_load(data, ARRAYS, encoding="latin1", path=path)
     pose = np.asarray(checks.entry(path, value, "poseCoeff"))
     if pose.dtype.kind in "fiu" and 0 < pose.size < 48:
         raise ShortPose(f"{path}: poseCoeff", "48 numbers", f"{pose.size}", "nothing to do: a known fault")

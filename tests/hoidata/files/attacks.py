@@ -189,7 +189,7 @@ def header_of_lists() -> bytes:
 
 
 def as_table(path: Path) -> Any:
-    return table("a.npy", restricted_load(path.read_bytes(), ARRAYS, where=path), 3)
+    return table("a.npy", restricted_load(path.read_bytes(), ARRAYS, path=path), 3)
 
 
 def as_obj(path: Path) -> Any:

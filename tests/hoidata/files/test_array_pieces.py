@@ -40,17 +40,17 @@ def whole(stored) -> np.ndarray:
 
 @pytest.mark.parametrize("dtype", ["int8", "uint8", "<i2", ">i4", "<i8", "<f4", ">f8", "bool"])
 @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
-def test_every_number_comes_back_whatever_its_type_and_the_pickles_version(tmp_path, dtype, protocol):
+def test_arrays_of_all_types_and_pickle_versions_round_trip(tmp_path, dtype, protocol):
     small, large = np.arange(12).reshape(3, 4).astype(dtype), (np.arange(30_000) % 56).reshape(300, 100).astype(dtype)
-    found = locate_arrays(save(tmp_path / "a.npz", {"object": large, "body": small}, protocol), "contact")
-    assert sorted(found) == ["body", "object"]
-    np.testing.assert_array_equal(whole(found["object"]), large)
-    np.testing.assert_array_equal(whole(found["body"]), small)
-    assert found["object"].shape == (300, 100)
-    assert found["object"].dtype == np.dtype(dtype)
+    arrays = locate_arrays(save(tmp_path / "a.npz", {"object": large, "body": small}, protocol), "contact")
+    assert sorted(arrays) == ["body", "object"]
+    np.testing.assert_array_equal(whole(arrays["object"]), large)
+    np.testing.assert_array_equal(whole(arrays["body"]), small)
+    assert arrays["object"].shape == (300, 100)
+    assert arrays["object"].dtype == np.dtype(dtype)
 
 
-def test_bytes_written_as_text_come_back_whatever_they_are(tmp_path):
+def test_bytes_written_as_text_round_trip(tmp_path):
     values = np.random.default_rng(0).normal(size=(700, 400)) * 1e9  # 2.2 MB; half of the bytes take two of UTF-8
     stored = locate_arrays(save(tmp_path / "a.npz", {"object": values}, protocol=2), "contact")["object"]
     np.testing.assert_array_equal(whole(stored), values)
@@ -71,14 +71,14 @@ def test_arrays_stored_column_by_column_come_as_columns(tmp_path, protocol):
     np.testing.assert_array_equal(whole(stored), values)
 
 
-def test_what_numpy_itself_saved_is_read_and_other_entries_are_left_alone(tmp_path):
+def test_files_saved_by_numpy_are_read_and_other_entries_are_skipped(tmp_path):
     values = np.arange(20_000).reshape(100, 200)
     content = {"object": values, "note": "a text", "list": [1, 2], "n": np.float64(3)}
     np.savez_compressed(tmp_path / "a.npz", contact=np.array(content, dtype=object), other=np.arange(3))
     assert npz_members(tmp_path / "a.npz") == {"contact", "other"}
-    found = locate_arrays(tmp_path / "a.npz", "contact")
-    assert list(found) == ["object"]
-    np.testing.assert_array_equal(whole(found["object"]), values)
+    arrays = locate_arrays(tmp_path / "a.npz", "contact")
+    assert list(arrays) == ["object"]
+    np.testing.assert_array_equal(whole(arrays["object"]), values)
 
 
 def test_pieces_say_which_row_they_start_at_and_memory_stays_small(tmp_path):
@@ -106,7 +106,7 @@ class Runs:
 
 @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
 @pytest.mark.parametrize("inside", [True, False])
-def test_a_pickle_that_would_run_something_is_refused_and_runs_nothing(tmp_path, protocol, inside):
+def test_a_pickle_with_a_call_is_refused_and_executes_nothing(tmp_path, protocol, inside):
     marker, values = tmp_path / "ran", np.zeros((100, 100))
     content = {"object": values, "extra": Runs(marker)} if inside else Runs(marker)
     with pytest.raises(BadInput) as caught:
@@ -185,7 +185,7 @@ def test_an_archive_that_is_none_or_lacks_the_member_is_named(tmp_path):
         assert expected in caught.value.expected
 
 
-def test_damage_in_the_middle_of_the_data_is_found(tmp_path):
+def test_damage_in_the_middle_of_the_data_is_detected(tmp_path):
     values = np.random.default_rng(0).integers(0, 255, (500, 500), dtype=np.uint8)
     path = save(tmp_path / "a.npz", {"object": values})
     data = bytearray(path.read_bytes())

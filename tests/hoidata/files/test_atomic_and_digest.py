@@ -55,18 +55,18 @@ def test_a_folder_is_never_seen_half_deleted(tmp_path, monkeypatch):
     target = tmp_path / "store"
     with atomic_folder(target) as part:
         (part / "old").write_text("1")
-    seen = []
+    states = []
     rmtree = shutil.rmtree
 
     def watched(folder, **options):
         if any(folder.glob("*")):
-            seen.append((folder != target, [path.name for path in target.iterdir()]))
+            states.append((folder != target, [path.name for path in target.iterdir()]))
         rmtree(folder, **options)
 
     monkeypatch.setattr(shutil, "rmtree", watched)
     with atomic_folder(target) as part:
         (part / "new").write_text("2")
-    assert seen == [(True, ["new"])]
+    assert states == [(True, ["new"])]
 
 
 def test_leftovers_of_killed_writers_are_removed_and_nothing_else(tmp_path):
@@ -96,7 +96,7 @@ def killed_writer(target: Path) -> None:
     assert subprocess.run([sys.executable, "-c", code, str(target)], check=False).returncode == -signal.SIGKILL
 
 
-def test_the_next_writer_of_a_folder_removes_what_killed_ones_left_and_nothing_of_living_ones(tmp_path):
+def test_the_next_writer_of_a_folder_removes_leftovers_of_killed_writers_only(tmp_path):
     target = tmp_path / "length"
     killed_writer(target)
     killed_writer(tmp_path / "contact")
@@ -112,7 +112,7 @@ def test_the_next_writer_of_a_folder_removes_what_killed_ones_left_and_nothing_o
     assert left == ["contact", "contact"]
 
 
-def test_an_old_folder_that_was_moved_aside_goes_back_to_its_place(tmp_path):
+def test_a_renamed_old_folder_is_restored(tmp_path):
     aside = tmp_path / ".clips.abcd1234.old"
     aside.mkdir()
     (aside / "old").write_text("1")

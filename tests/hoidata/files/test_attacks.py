@@ -42,17 +42,17 @@ def in_a_process_of_its_own(read: Callable[[Path], Any], path: Path) -> dict:
             os._exit(0)
     os.close(sending)
     with os.fdopen(receiving, "rb") as stream:
-        told = stream.read()
+        report = stream.read()
     os.waitpid(child, 0)
-    return json.loads(told or b'{"end": "was ended", "seconds": 99, "megabytes": 9999}')
+    return json.loads(report or b'{"end": "was ended", "seconds": 99, "megabytes": 9999}')
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "make", "read"), ATTACKS, ids=[name for name, *_ in ATTACKS])
-def test_a_small_file_that_grows_without_bound_is_bad_input_at_once(tmp_path, name, make, read):
+def test_a_small_file_that_expands_without_bound_is_bad_input_immediately(tmp_path, name, make, read):
     path = tmp_path / name
     path.write_bytes(make())
-    found = in_a_process_of_its_own(read, path)
-    assert found["end"].startswith(BadInput.__name__), found
-    assert found["seconds"] < MOST_SECONDS, found
-    assert found["megabytes"] < MOST_MEGABYTES, found
+    outcome = in_a_process_of_its_own(read, path)
+    assert outcome["end"].startswith(BadInput.__name__), outcome
+    assert outcome["seconds"] < MOST_SECONDS, outcome
+    assert outcome["megabytes"] < MOST_MEGABYTES, outcome

@@ -30,7 +30,7 @@ def npy_of_numpy_1(value):
 ARCTIC = {"right": {"rot": np.arange(6.0).reshape(2, 3), "shape": np.zeros(10), "fitting_err": [0.1, 0.2]}}
 
 
-def test_a_dict_saved_by_numpy_1_or_2_comes_back(tmp_path):
+def test_a_dict_saved_by_numpy_1_or_2_round_trips(tmp_path):
     (tmp_path / "old.npy").write_bytes(npy_of_numpy_1(ARCTIC))
     np.save(tmp_path / "new.npy", np.array(ARCTIC, dtype=object), allow_pickle=True)
     for name in ("old.npy", "new.npy"):
@@ -39,7 +39,7 @@ def test_a_dict_saved_by_numpy_1_or_2_comes_back(tmp_path):
         assert loaded["right"]["fitting_err"] == [0.1, 0.2]
 
 
-def test_plain_arrays_come_back_from_both_readers(tmp_path):
+def test_both_readers_load_plain_arrays(tmp_path):
     for array in (np.eye(3), np.asfortranarray(np.arange(6).reshape(2, 3)), np.array(["a", "bc"]), np.zeros((0, 7))):
         np.save(tmp_path / "a.npy", array)
         np.testing.assert_array_equal(load_npy(tmp_path / "a.npy"), array)
@@ -64,7 +64,7 @@ def grab(path):
     )
 
 
-def test_grab_members_come_back_as_items(tmp_path):
+def test_grab_members_are_loaded_as_items(tmp_path):
     grab(tmp_path / "s.npz")
     loaded = load_npz_objects(tmp_path / "s.npz")
     assert (loaded["gender"], loaded["n_frames"], loaded["framerate"]) == ("male", 240, 120.0)
@@ -119,8 +119,8 @@ def test_too_many_members_are_refused(tmp_path):
         load_npz_objects(tmp_path / "a.npz")
 
 
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.9, 0.999])
-def test_truncated_files_are_bad_input(tmp_path, share):
+@pytest.mark.parametrize("fraction", [0.0, 0.01, 0.5, 0.9, 0.999])
+def test_truncated_files_are_bad_input(tmp_path, fraction):
     grab(tmp_path / "s.npz")
     np.save(tmp_path / "plain.npy", np.arange(1000))
     (tmp_path / "object.npy").write_bytes(npy_of_numpy_1(ARCTIC))
@@ -128,7 +128,7 @@ def test_truncated_files_are_bad_input(tmp_path, share):
     for name, reader in readers.items():
         path = tmp_path / name
         data = path.read_bytes()
-        path.write_bytes(data[: int(len(data) * share)])
+        path.write_bytes(data[: int(len(data) * fraction)])
         with pytest.raises(BadInput, match=name):
             reader(path)
 
@@ -152,7 +152,7 @@ def test_a_missing_file_or_a_folder_is_bad_input(tmp_path, reader):
 @pytest.mark.parametrize("reader", [load_npz_arrays, load_npz_objects])
 @pytest.mark.parametrize("pickled", [False, True])
 def test_an_archive_may_unpack_to_eight_times_its_size(tmp_path, monkeypatch, reader, pickled):
-    """Recorded numbers shrink to a half; a megabyte of zeros, which unpacks to a gigabyte, is no recording."""
+    """Recorded numbers shrink to a half; a megabyte of zeros, which unpacks to a gigabyte, is not a recording."""
     if pickled and reader is load_npz_arrays:
         pytest.skip("it reads no objects")
     monkeypatch.setattr("hoidata.files.numpy_files._FREE_BYTES", 1000)
@@ -161,14 +161,14 @@ def test_an_archive_may_unpack_to_eight_times_its_size(tmp_path, monkeypatch, re
         np.savez_compressed(tmp_path / f"{name}.npz", a=np.array({"x": array}, dtype=object) if pickled else array)
         np.savez(tmp_path / f"{name}-stored.npz", a=np.array({"x": array}, dtype=object) if pickled else array)
     for name in ("recorded", "recorded-stored", "zeros-stored"):
-        found = reader(tmp_path / f"{name}.npz")["a"]
-        np.testing.assert_array_equal(found["x"] if pickled else found, zeros if "zeros" in name else recorded)
+        array = reader(tmp_path / f"{name}.npz")["a"]
+        np.testing.assert_array_equal(array["x"] if pickled else array, zeros if "zeros" in name else recorded)
     with pytest.raises(BadInput, match=r"when unpacked, got \d+; download it again, or store it uncompressed"):
         reader(tmp_path / "zeros.npz")
 
 
 def test_the_pickles_of_one_archive_share_a_limit_of_opcodes(tmp_path, monkeypatch):
-    monkeypatch.setattr("hoidata.files.pickle_check._MOST_OPCODES", 700)
+    monkeypatch.setattr("hoidata.files.pickle_check._MAX_OPCODES", 700)
     members = {f"m{number}": np.array([[1] * 40], dtype=object) for number in range(10)}
     for count in (4, 10):
         np.savez_compressed(tmp_path / "a.npz", **dict(list(members.items())[:count]))
@@ -186,13 +186,13 @@ ARRAYS = {
 }
 
 
-def test_arrays_come_back_with_their_shape_and_type(tmp_path: Path) -> None:
+def test_arrays_keep_their_shape_and_type(tmp_path: Path) -> None:
     write_npz(tmp_path / "a.npz", ARRAYS)
-    found = read_npz(tmp_path / "a.npz")
-    assert list(found) == list(ARRAYS)
+    arrays = read_npz(tmp_path / "a.npz")
+    assert list(arrays) == list(ARRAYS)
     for name, array in ARRAYS.items():
-        assert (found[name].shape, found[name].dtype) == (array.shape, array.dtype)
-        np.testing.assert_array_equal(found[name], array)
+        assert (arrays[name].shape, arrays[name].dtype) == (array.shape, array.dtype)
+        np.testing.assert_array_equal(arrays[name], array)
 
 
 def test_equal_arrays_give_equal_bytes_that_are_not_compressed(tmp_path: Path) -> None:
@@ -205,15 +205,15 @@ def test_equal_arrays_give_equal_bytes_that_are_not_compressed(tmp_path: Path) -
 
 def test_the_bytes_are_those_of_numpy_on_a_python_after_3_11_3(tmp_path: Path) -> None:
     write_npz(tmp_path / "a.npz", {"number": ARRAYS["number"]})
-    found = (tmp_path / "a.npz").read_bytes()
+    data = (tmp_path / "a.npz").read_bytes()
     # Signature, version 4.5, no flags, stored, 1 January 1980 at midnight, checksum, 2 x 32 bits of ones; the name has
     # 10 letters, the extra field 20 bytes: its number 1, 16 bytes that follow, and the size twice in 64 bits.
-    assert found[:14] == b"PK\x03\x04" + bytes([45, 0, 0, 0, 0, 0, 0, 0, 33, 0])
-    assert found[18:40] == b"\xff" * 8 + bytes([10, 0, 20, 0]) + b"number.npy"
-    assert found[40:60] == bytes([1, 0, 16, 0]) + (130).to_bytes(8, "little") * 2
+    assert data[:14] == b"PK\x03\x04" + bytes([45, 0, 0, 0, 0, 0, 0, 0, 33, 0])
+    assert data[18:40] == b"\xff" * 8 + bytes([10, 0, 20, 0]) + b"number.npy"
+    assert data[40:60] == bytes([1, 0, 16, 0]) + (130).to_bytes(8, "little") * 2
     if sys.version_info >= (3, 11, 4):
         np.savez(tmp_path / "b.npz", allow_pickle=False, number=ARRAYS["number"])
-        assert found == (tmp_path / "b.npz").read_bytes()
+        assert data == (tmp_path / "b.npz").read_bytes()
 
 
 def test_python_objects_are_neither_written_nor_read(tmp_path: Path) -> None:
@@ -261,7 +261,7 @@ def head(shape: str = "(2,)", descr: str = "'<f8'", order: str = "False") -> str
     ],
     ids=["c", "fortran", "text", "bytes", "flags", "empty", "scalar"],
 )
-def test_what_numpy_saves_is_read_alike_and_can_be_changed(tmp_path, array, version):
+def test_files_saved_by_numpy_give_equal_writable_arrays(tmp_path, array, version):
     with open(tmp_path / "a.npy", "wb") as stream:
         np.lib.format.write_array(stream, array, version=(version, 0))
     loaded = load_npy(tmp_path / "a.npy")
@@ -341,7 +341,7 @@ def test_a_sealed_file_is_whole_and_reads_as_any_safetensors_file(tmp_path):
     )
 
 
-def test_a_flipped_bit_of_any_byte_is_found_and_told_of_the_half_it_is_in(tmp_path):
+def test_a_flipped_bit_is_detected_and_assigned_to_its_half_of_the_file(tmp_path):
     path = stored(tmp_path, seal=OPEN_SEAL)
     whole = path.read_bytes()
     start = 8 + int.from_bytes(whole[:8], "little")
@@ -353,7 +353,7 @@ def test_a_flipped_bit_of_any_byte_is_found_and_told_of_the_half_it_is_in(tmp_pa
             fault = seal_fault(path)
         except BadInput:
             fault = "header"  # no longer the header of a checkpoint
-        # A flipped digest of the weights accuses the weights: which of the two was hit cannot be told.
+        # A flipped digest of the weights counts as corrupted weights, because the two cases are indistinguishable.
         assert fault == "weights" if number >= start else fault in ("header", "weights"), number
 
 
@@ -364,11 +364,11 @@ def test_a_file_written_before_there_were_seals_is_not_accused(tmp_path):
 def test_a_broken_seal_is_refused_with_the_half_that_was_changed(tmp_path):
     path = stored(tmp_path, seal=OPEN_SEAL)
     path.write_bytes(path.read_bytes()[:-1] + b"\xff")
-    with pytest.raises(BadInput, match="expected the weights it was written with"):
+    with pytest.raises(BadInput, match="expected weights matching the checksum"):
         check_seal(path)
 
 
-def test_metadata_that_is_no_object_is_refused(tmp_path):
+def test_metadata_other_than_an_object_is_refused(tmp_path):
     path = tmp_path / "model.safetensors"
     path.write_bytes(save(TENSORS, {"hoidata": json.dumps([1])}))
     with pytest.raises(BadInput, match="provenance"):

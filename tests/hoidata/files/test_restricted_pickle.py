@@ -31,22 +31,22 @@ def sample():
     }
 
 
-def assert_same(got, wanted):
-    assert type(got) is type(wanted)
-    if isinstance(wanted, dict):
-        assert got.keys() == wanted.keys()
-        for key in wanted:
-            assert_same(got[key], wanted[key])
-    elif isinstance(wanted, list | tuple) or (isinstance(wanted, np.ndarray) and wanted.dtype.hasobject):
-        assert len(got) == len(wanted)
-        for one, other in zip(got, wanted, strict=True):
+def assert_same(got, expected):
+    assert type(got) is type(expected)
+    if isinstance(expected, dict):
+        assert got.keys() == expected.keys()
+        for key in expected:
+            assert_same(got[key], expected[key])
+    elif isinstance(expected, list | tuple) or (isinstance(expected, np.ndarray) and expected.dtype.hasobject):
+        assert len(got) == len(expected)
+        for one, other in zip(got, expected, strict=True):
             assert_same(one, other)
-    elif isinstance(wanted, np.ndarray):
+    elif isinstance(expected, np.ndarray):
         # NumPy turns big-endian arrays into native ones below protocol 5.
-        assert got.dtype.newbyteorder("=") == wanted.dtype.newbyteorder("=")
-        np.testing.assert_array_equal(got, wanted)
+        assert got.dtype.newbyteorder("=") == expected.dtype.newbyteorder("=")
+        np.testing.assert_array_equal(got, expected)
     else:
-        assert got == wanted
+        assert got == expected
 
 
 @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
@@ -177,14 +177,14 @@ def test_an_allowed_name_cannot_be_changed_for_the_files_that_follow(name, state
     assert restricted_load(b"\x80\x02cbuiltins\nset\n)R.", ARRAYS) == set()
 
 
-def test_every_truncation_is_a_bad_input():
+def test_truncated_files_raise_bad_input():
     data = pickle.dumps(sample(), 2)
     for length in range(0, len(data), 7):
         with pytest.raises(BadInput, match="some file"):
-            restricted_load(data[:length], ARRAYS, where="some file")
+            restricted_load(data[:length], ARRAYS, path="some file")
 
 
-def test_every_flipped_byte_is_read_or_refused_but_never_runs_wild():
+def test_flipped_bytes_are_read_or_refused_without_other_errors():
     data = pickle.dumps({"a": np.arange(4.0), "b": "text"}, 2)
     generator = np.random.default_rng(0)
     for _ in range(500):
@@ -216,7 +216,7 @@ def test_keys_that_would_overflow_the_stack_or_take_for_ever_to_hash_are_refused
 
 
 def test_a_pickle_of_millions_of_opcodes_is_refused(monkeypatch):
-    monkeypatch.setattr("hoidata.files.pickle_check._MOST_OPCODES", 100)
+    monkeypatch.setattr("hoidata.files.pickle_check._MAX_OPCODES", 100)
     assert restricted_load(pickle.dumps([1] * 40), ARRAYS) == [1] * 40
     with pytest.raises(BadInput, match="more than 100 opcodes"):
         restricted_load(pickle.dumps([1] * 100), ARRAYS)
@@ -259,7 +259,7 @@ def test_keys_whose_hash_a_file_can_choose_are_refused_by_name(name):
         restricted_load(data[name], ARRAYS)
 
 
-def test_keys_of_64_bits_and_larger_numbers_that_are_no_keys_are_read():
+def test_keys_of_64_bits_and_larger_values_are_read():
     keys = {
         2**64 - 1: 2**70,
         -(2**63): -(2**70),
@@ -283,7 +283,7 @@ def test_text_of_impossible_characters_is_refused():
 
 
 @pytest.mark.parametrize("data", [b"cnumpy\nndarray\n.", b"]cbuiltins\nset\na.", b"cnumpy\ndtype\n(S'f8'\nI0\nI1\ntR."])
-def test_no_result_holds_a_stand_in_of_the_reader(data):
+def test_results_contain_no_stand_ins_of_the_reader(data):
     with pytest.raises(BadInput, match="by itself"):
         restricted_load(data, ARRAYS)
 
@@ -318,7 +318,7 @@ TENSOR_NAMES = {
 STORAGES = {f"{kind}Storage" for kind in ("Double", "Float", "Half", "Long", "Int", "Short", "Char", "Byte", "Bool")}
 
 
-def test_each_kind_of_file_may_name_exactly_what_the_specification_lists():
+def test_each_kind_of_file_has_exactly_the_specified_allow_list():
     assert set(ARRAYS) == ARRAY_NAMES
     assert set(_ALLOW) == ARRAY_NAMES | MANO_NAMES
     assert set(_allowed([])) == ARRAY_NAMES
@@ -326,14 +326,14 @@ def test_each_kind_of_file_may_name_exactly_what_the_specification_lists():
     assert set(STORAGE_NAMES) == {f"{module} {name}" for module in ("torch", "torch.cuda") for name in STORAGES}
 
 
-def test_the_readme_lists_every_name():
+def test_the_readme_lists_all_allowed_names():
     text = re.sub(r"\s+", " ", Path(hoidata.files.__file__).with_name("README.md").read_text())
     for module, name in ARRAY_NAMES | MANO_NAMES | TENSOR_NAMES:
         assert f"`{module} {name}`" in text or (f"`{module}`" in text and f"`{name}`" in text), (module, name)
     assert all(f"`{name}`" in text for name in STORAGES)
 
 
-def test_no_list_leads_to_a_real_function_or_class_of_another_package():
+def test_allow_lists_contain_no_function_or_class_of_another_package():
     values = [*_ALLOW.values(), *tensor_globals(1).values()]
     for value in values:
         module = getattr(value, "__module__", None) or type(value).__module__

@@ -22,13 +22,13 @@ def hand_file():
 def cuda_tagged(data: bytes) -> bytes:
     """The bytes a tensor on a GPU has: only the location in its storage's persistent id differs (protocol 3)."""
     cpu, cuda = b"X\x03\x00\x00\x00cpu", b"X\x06\x00\x00\x00cuda:0"
-    patched, place = bytearray(), 0
+    patched, offset = bytearray(), 0
     for blob, at in _blobs(data):
         new = blob.replace(cpu, cuda)
         assert cuda in new
-        patched += data[place:at] + b"B" + len(new).to_bytes(4, "little") + new
-        place = at + 5 + len(blob)
-    return bytes(patched + data[place:])
+        patched += data[offset:at] + b"B" + len(new).to_bytes(4, "little") + new
+        offset = at + 5 + len(blob)
+    return bytes(patched + data[offset:])
 
 
 def _blobs(data: bytes):
@@ -38,7 +38,7 @@ def _blobs(data: bytes):
             yield argument, at
 
 
-def test_tensors_inside_containers_come_back_as_own_writable_arrays(tmp_path):
+def test_tensors_inside_containers_become_separate_writable_arrays(tmp_path):
     content = {
         "hands": hand_file(),
         "ordered": OrderedDict(b=torch.arange(6).reshape(2, 3).T, a=(torch.tensor(2.5, dtype=torch.float64), "text")),
@@ -68,26 +68,26 @@ def test_tensors_inside_containers_come_back_as_own_writable_arrays(tmp_path):
 
 @pytest.mark.parametrize("protocol", [3, 4, 5])
 @pytest.mark.parametrize("kind", ["float64", "float32", "float16", "int64", "int32", "int16", "int8", "uint8", "bool"])
-def test_every_number_type_and_protocol_is_read_as_torch_has_it(kind, protocol):
+def test_all_number_types_and_protocols_equal_torch(kind, protocol):
     tensor = torch.tensor([[0, 1, 2], [3, 4, 5]]).to(getattr(torch, kind))
     loaded = load_torch_pickle(pickle.dumps([tensor], protocol), "x.pkl")
     np.testing.assert_array_equal(loaded[0], tensor.numpy(), strict=True)
 
 
-def test_small_storages_are_read_at_once_as_torch_itself_reads_them(monkeypatch):
+def test_the_fast_parser_of_small_storages_equals_torch(monkeypatch):
     """One byte changed in a storage's own bytes: known no more, and read or refused by torch's rules as ever."""
     data = pickle.dumps([torch.randn(2, 3), torch.randn(300, dtype=torch.float64), torch.zeros(0)])
     blobs = [blob for blob, _ in _blobs(data)]
-    assert all(torch_pickle._usual_elements(blob) is not None for blob in blobs)
+    assert all(torch_pickle._parse_common_storage(blob) is not None for blob in blobs)
     quick = load_torch_pickle(data, "x.pkl")
-    for place in range(len(blobs[0]) - 24):
+    for offset in range(len(blobs[0]) - 24):
         changed = bytearray(blobs[0])
-        changed[place] ^= 1
-        found = torch_pickle._usual_elements(bytes(changed))
-        assert found is None or found.tobytes() == blobs[0][-24:]
-    for spoilt in (blobs[0] + b"\0", blobs[0][:-1]):
-        assert torch_pickle._usual_elements(spoilt) is None
-    monkeypatch.setattr(torch_pickle, "_usual_elements", lambda _: None)
+        changed[offset] ^= 1
+        elements = torch_pickle._parse_common_storage(bytes(changed))
+        assert elements is None or elements.tobytes() == blobs[0][-24:]
+    for corrupted in (blobs[0] + b"\0", blobs[0][:-1]):
+        assert torch_pickle._parse_common_storage(corrupted) is None
+    monkeypatch.setattr(torch_pickle, "_parse_common_storage", lambda _: None)
     for one, other in zip(quick, load_torch_pickle(data, "x.pkl"), strict=True):
         np.testing.assert_array_equal(one, other, strict=True)
 
@@ -242,7 +242,7 @@ def test_a_storage_that_contradicts_itself_is_refused(old, new):
         load_torch_pickle(with_blob(data, lambda blob: blob.replace(old, new)), "x.pkl")
 
 
-def test_a_pickle_cannot_change_what_the_next_file_is_read_with():
+def test_a_pickle_cannot_change_the_reader_of_the_next_file():
     change = b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\nN}X\x0c\x00\x00\x00__defaults__K\x07\x85s\x86b."
     with pytest.raises(BadInput, match="not allowed"):
         load_torch_pickle(change, "x.pkl")
@@ -254,7 +254,7 @@ def test_a_missing_file_and_a_folder_are_bad_input(tmp_path):
             load_torch_pickle(path, path)
 
 
-def test_every_truncation_is_a_bad_input():
+def test_truncated_files_raise_bad_input():
     data = pickle.dumps(hand_file())
     for length in range(0, len(data), 11):
         with pytest.raises(BadInput):
@@ -262,7 +262,7 @@ def test_every_truncation_is_a_bad_input():
 
 
 def test_a_storage_named_many_times_cannot_fill_the_memory():
-    """Each of 400 tensors would otherwise keep its own copy of 8 MB."""
+    """Each of 400 tensors would otherwise have a separate copy of 8 MB."""
     stream = io.BytesIO()
     storage = torch.zeros(2 * 2**20)._typed_storage()
     function, (blob,) = storage.__reduce__()

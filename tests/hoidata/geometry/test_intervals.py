@@ -23,8 +23,8 @@ def test_runs_are_the_maximal_stretches_of_true(flags, expected):
     [("1001", 2, "1111"), ("10001", 2, "10001"), ("0010100", 5, "0011100"), ("000", 9, "000"), ("", 1, "")],
 )
 def test_only_gaps_between_true_ones_are_bridged_and_only_short_ones(flags, longest, expected):
-    given = np.array([flag == "1" for flag in flags], dtype=bool)
-    assert bridged(given, longest).tolist() == [flag == "1" for flag in expected]
+    flag_array = np.array([flag == "1" for flag in flags], dtype=bool)
+    assert bridged(flag_array, longest).tolist() == [flag == "1" for flag in expected]
 
 
 def test_step_is_sudden_when_it_is_notable_and_several_times_the_motion_around_it():

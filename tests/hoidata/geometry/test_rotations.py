@@ -30,13 +30,13 @@ def cross_matrix(vector):
 @pytest.mark.parametrize("kind", [np.asarray, torch.as_tensor])
 def test_rotvec_to_rotmat_is_the_matrix_exponential(kind):
     vectors = rotvecs()
-    wanted = np.stack([expm(cross_matrix(vector)) for vector in vectors])
+    expected = np.stack([expm(cross_matrix(vector)) for vector in vectors])
     got = rotvec_to_rotmat(kind(vectors))
     assert type(got) is type(kind(vectors))
-    np.testing.assert_allclose(np.asarray(got), wanted, atol=1e-13)
+    np.testing.assert_allclose(np.asarray(got), expected, atol=1e-13)
 
 
-def test_rotation_about_z_turns_x_towards_y():
+def test_rotation_about_z_takes_x_towards_y():
     quarter = rotvec_to_rotmat(np.array([0.0, 0.0, np.pi / 2]))
     np.testing.assert_allclose(quarter @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-15)
 
@@ -61,8 +61,8 @@ def test_six_numbers_round_trip_and_are_the_first_two_columns_row_by_row(kind):
     matrices = kind(rotvec_to_rotmat(rotvecs()))
     six = rotmat_to_rot6d(matrices)
     first = np.asarray(matrices)[40]
-    wanted = [first[0, 0], first[0, 1], first[1, 0], first[1, 1], first[2, 0], first[2, 1]]
-    np.testing.assert_array_equal(np.asarray(six)[40], wanted)
+    expected = [first[0, 0], first[0, 1], first[1, 0], first[1, 1], first[2, 0], first[2, 1]]
+    np.testing.assert_array_equal(np.asarray(six)[40], expected)
     np.testing.assert_allclose(np.asarray(rot6d_to_rotmat(six)), np.asarray(matrices), atol=1e-12)
 
 
@@ -94,11 +94,11 @@ def test_gradient_is_right_at_and_around_zero():
 
 def test_float32_stays_float32_and_accurate():
     vectors = rotvecs().astype(np.float32)
-    wanted = np.stack([expm(cross_matrix(vector.astype(np.float64))) for vector in vectors])
+    expected = np.stack([expm(cross_matrix(vector.astype(np.float64))) for vector in vectors])
     for kind in (np.asarray, torch.as_tensor):
         got = np.asarray(rotvec_to_rotmat(kind(vectors)))
         assert got.dtype == np.float32
-        np.testing.assert_allclose(got, wanted, atol=5e-7)
+        np.testing.assert_allclose(got, expected, atol=5e-7)
 
 
 def test_skew_is_the_cross_product():
@@ -115,17 +115,17 @@ def test_no_rotations_give_no_rotations():
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_canonical_axis_angles_are_the_same_rotations_of_at_most_pi_and_shorter_ones_stay_bit_for_bit(dtype):
     vectors = rotvecs((0.0, 0.5, 3.14159, 3.2, 4.0, 6.2, 6.4, 8.6, 12.0)).astype(dtype)
-    found, exact = canonical_rotvec(vectors), 1e-6 if dtype == np.float32 else 1e-12
-    for vector, canonical in zip(vectors.astype(np.float64), found.astype(np.float64), strict=True):
+    result, exact = canonical_rotvec(vectors), 1e-6 if dtype == np.float32 else 1e-12
+    for vector, canonical in zip(vectors.astype(np.float64), result.astype(np.float64), strict=True):
         np.testing.assert_allclose(expm(cross_matrix(canonical)), expm(cross_matrix(vector)), atol=10 * exact)
-    assert np.linalg.norm(found, axis=1).max() <= np.pi + exact
+    assert np.linalg.norm(result, axis=1).max() <= np.pi + exact
     short = np.linalg.norm(vectors, axis=1) < 3.15
-    assert found[short].tobytes() == vectors[short].tobytes()
-    assert found.dtype == dtype
+    assert result[short].tobytes() == vectors[short].tobytes()
+    assert result.dtype == dtype
 
 
 def test_an_axis_angle_nearest_to_a_reference_is_the_same_rotation_across_pi():
     degrees = np.deg2rad([[[179.0, 0, 0], [0, -179.0, 0], [0, 0, 30.0], [0, 0, 0]]])
     reference = np.deg2rad([[[-179.0, 0, 0], [0, 178.0, 0], [0, 0, -20.0], [0, 0, 170.0]]])
-    wanted = np.deg2rad([[[-181.0, 0, 0], [0, 181.0, 0], [0, 0, 30.0], [0, 0, 0]]])
-    np.testing.assert_allclose(nearest_rotvec(degrees, reference), wanted, atol=1e-12)
+    expected = np.deg2rad([[[-181.0, 0, 0], [0, 181.0, 0], [0, 0, 30.0], [0, 0, 0]]])
+    np.testing.assert_allclose(nearest_rotvec(degrees, reference), expected, atol=1e-12)

@@ -14,13 +14,13 @@ FEW = st.sampled_from([-1.5, -0.0, 0.0, 0.25, 3.0])
 @given(arrays(np.float64, array_shapes(min_dims=2, max_dims=2, max_side=9), elements=FEW))
 def test_rows_are_numbered_as_numpy_sorts_them(rows: np.ndarray) -> None:
     _, first, number = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    found = distinct_rows(rows)
-    np.testing.assert_array_equal(found.first, first)
-    np.testing.assert_array_equal(found.number, number.reshape(-1))
+    result = distinct_rows(rows)
+    np.testing.assert_array_equal(result.first, first)
+    np.testing.assert_array_equal(result.number, number.reshape(-1))
 
 
 @pytest.mark.parametrize("dtype", [np.int64, np.float32])
-def test_without_rows_nothing_is_found(dtype: type) -> None:
+def test_an_array_without_rows_has_no_distinct_rows(dtype: type) -> None:
     first, number = distinct_rows(np.zeros((0, 3), dtype))
     assert first.shape == number.shape == (0,)
 

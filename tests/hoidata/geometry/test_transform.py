@@ -40,9 +40,9 @@ def test_a_chain_of_transforms_and_its_inverse_equal_products_of_homogeneous_mat
         (world_from_part.inverse(), np.linalg.inv(first @ second)),
         (object_from_part.inverse() @ world_from_object.inverse(), np.linalg.inv(first @ second)),
     ):
-        found = transform @ kind(points)
-        assert type(found) is type(kind(points))
-        np.testing.assert_allclose(np.asarray(found), moved(matrix, points), atol=1e-12)
+        result = transform @ kind(points)
+        assert type(result) is type(kind(points))
+        np.testing.assert_allclose(np.asarray(result), moved(matrix, points), atol=1e-12)
         np.testing.assert_allclose(np.asarray(transform.translation), matrix[:, :3, 3], atol=1e-12)
         np.testing.assert_allclose(np.asarray(transform.rotation), matrix[:, :3, :3], atol=1e-12)
 
@@ -61,7 +61,7 @@ def test_points_that_all_frames_share_and_rows_that_are_picked_keep_their_axes(k
     np.testing.assert_allclose(np.asarray(hinge @ kind(np.ones((1, 3)))), np.ones((FRAMES, 1, 3)), atol=1e-12)
 
 
-def test_directions_are_turned_and_not_moved(kind):
+def test_directions_are_rotated_and_not_translated(kind):
     transform, matrix = poses(kind, 6)
     vectors = np.random.default_rng(7).normal(size=(FRAMES, 2, 3))
     expected = np.einsum("fij,fpj->fpi", matrix[:, :3, :3], vectors)

@@ -27,19 +27,19 @@ def queries() -> np.ndarray:
 
 def test_signed_distance_to_a_box_equals_the_formula(queries: np.ndarray) -> None:
     box = trimesh.creation.box((0.06, 0.04, 0.1))
-    found = signed_distance(box.vertices, box.faces, queries)
-    np.testing.assert_allclose(found.distance_m, box_distance(queries, np.array((0.03, 0.02, 0.05))), atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(found.closest_m - queries, axis=1), abs(found.distance_m), atol=1e-12)
+    result = signed_distance(box.vertices, box.faces, queries)
+    np.testing.assert_allclose(result.distance_m, box_distance(queries, np.array((0.03, 0.02, 0.05))), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(result.closest_m - queries, axis=1), abs(result.distance_m), atol=1e-12)
 
 
 def test_signed_distance_to_a_fine_sphere_is_radius_minus_its_sagitta(queries: np.ndarray) -> None:
     sphere = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
-    found = signed_distance(sphere.vertices, sphere.faces, queries)
-    error = found.distance_m - (np.linalg.norm(queries, axis=1) - 0.05)
+    result = signed_distance(sphere.vertices, sphere.faces, queries)
+    error = result.distance_m - (np.linalg.norm(queries, axis=1) - 0.05)
     assert np.abs(error).max() < 1e-4
     away = np.linalg.norm(queries, axis=1) > 0.01
-    outward = found.closest_m / np.linalg.norm(found.closest_m, axis=1, keepdims=True)
-    assert (found.normal * outward).sum(axis=1)[away].min() > 0.99
+    outward = result.closest_m / np.linalg.norm(result.closest_m, axis=1, keepdims=True)
+    assert (result.normal * outward).sum(axis=1)[away].min() > 0.99
 
 
 def test_a_mesh_split_into_separate_triangles_gives_the_same_signs(queries: np.ndarray) -> None:
@@ -50,7 +50,7 @@ def test_a_mesh_split_into_separate_triangles_gives_the_same_signs(queries: np.n
 
 
 @pytest.mark.parametrize("missing", [0, 1], ids=["closed", "open"])
-def test_a_mesh_turned_inside_out_has_the_same_inside(queries: np.ndarray, missing: int) -> None:
+def test_an_inverted_mesh_has_the_same_inside(queries: np.ndarray, missing: int) -> None:
     sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
     vertices, faces = sphere.vertices + np.array([0.3, 0, 0]), sphere.faces[missing:]
     outward = signed_distance(vertices, faces, queries + np.array([0.3, 0, 0]))
@@ -63,8 +63,8 @@ def test_a_mesh_turned_inside_out_has_the_same_inside(queries: np.ndarray, missi
 def test_a_box_with_a_small_hole_still_knows_its_inside() -> None:
     sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
     points = np.array([[0.0, 0, 0], [0.02, 0, 0], [0.1, 0, 0]])
-    found = signed_distance(sphere.vertices, sphere.faces[1:], points)
-    assert (found.distance_m < 0).tolist() == [True, True, False]
+    result = signed_distance(sphere.vertices, sphere.faces[1:], points)
+    assert (result.distance_m < 0).tolist() == [True, True, False]
 
 
 @pytest.mark.parametrize(
@@ -77,5 +77,5 @@ def test_a_mesh_without_a_surface_is_refused(vertices: np.ndarray, faces: list) 
 
 def test_a_distance_is_that_to_its_closest_point(queries: np.ndarray) -> None:
     box = trimesh.creation.box((0.06, 0.04, 0.1))
-    found = closest_points(box.vertices, box.faces, queries)
-    np.testing.assert_allclose(found.distance_m, np.linalg.norm(found.closest_m - queries, axis=1), atol=1e-12)
+    result = closest_points(box.vertices, box.faces, queries)
+    np.testing.assert_allclose(result.distance_m, np.linalg.norm(result.closest_m - queries, axis=1), atol=1e-12)

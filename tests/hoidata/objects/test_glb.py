@@ -20,7 +20,7 @@ TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 
 
 class Document:
-    """Builds a GLB file: each array becomes an accessor with a view of its own."""
+    """Builds a GLB file: each array becomes an accessor with a separate view."""
 
     def __init__(self) -> None:
         self.body = b""
@@ -34,8 +34,8 @@ class Document:
         return len(self.tree["accessors"]) - 1
 
     def view(self, array, stride=0):
-        rows = [row.tobytes() for row in array]
-        data = b"".join(row + b"\xee" * (stride - len(row)) for row in rows) if stride else b"".join(rows)
+        items = [item.tobytes() for item in array]
+        data = b"".join(item + b"\xee" * (stride - len(item)) for item in items) if stride else b"".join(items)
         self.body += b"\xee" * (-len(self.body) % 4)
         view = {"buffer": 0, "byteOffset": len(self.body), "byteLength": len(data)}
         self.tree["bufferViews"].append(view | ({"byteStride": stride} if stride else {}))
@@ -138,14 +138,14 @@ def indices_of(kind):
 
 
 def strip(document):
-    """Four faces in one strip: its odd triangles turn round by themselves."""
+    """Four faces in one strip, whose odd triangles have the opposite orientation."""
     order = np.array([0, 2, 1, 3, 0, 2], "<u2")
     attributes = {"POSITION": document.accessor(CORNERS)}
     document.node(mesh=document.mesh({"attributes": attributes, "indices": document.accessor(order), "mode": 5}))
 
 
 def fan(document):
-    """Three faces about corner 0 as a fan, and the fourth as a triangle; a line is no part of the mesh."""
+    """Three faces about corner 0 as a fan, and the fourth as a triangle; a line is not part of the mesh."""
     attributes = {"POSITION": document.accessor(CORNERS)}
     around, last = (document.accessor(np.array(order, "<u2")) for order in ([0, 2, 1, 3, 2], [1, 2, 3]))
     document.node(
@@ -215,22 +215,22 @@ def in_base64(document):
     document.body = b""
 
 
-WAYS = {
+ENCODINGS = {
     "plain": tetrahedron,
     **{f"normalised {kind}": normalised(kind) for kind in ("|i1", "|u1", "<i2", "<u2")},
     "whole numbers": whole_numbers,
     **{f"indices {kind}": indices_of(kind) for kind in ("|u1", "<u2", "<u4")},
-    **{own.__name__: own for own in (sparse, sparse_alone, strided, without_indices, strip, fan, under_nodes)},
-    **{own.__name__: own for own in (mirrored, morphed, morphed_by_its_node, skinned, in_base64)},
+    **{build.__name__: build for build in (sparse, sparse_alone, strided, without_indices, strip, fan, under_nodes)},
+    **{build.__name__: build for build in (mirrored, morphed, morphed_by_its_node, skinned, in_base64)},
 }
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_a_tetrahedron_written_in_another_way_is_the_same_tetrahedron(way):
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_a_tetrahedron_in_another_encoding_is_the_same_tetrahedron(encoding):
     document = Document()
-    WAYS[way](document)
-    tolerance = 0.3 / 127 if "1" in way else 0.3 / 2**14  # half a step of the coarsest numbers
-    np.testing.assert_allclose(triangles(document.bytes()), PLAIN, atol=tolerance if "normalised" in way else 2e-6)
+    ENCODINGS[encoding](document)
+    tolerance = 0.3 / 127 if "1" in encoding else 0.3 / 2**14  # half a step of the coarsest numbers
+    np.testing.assert_allclose(triangles(document.bytes()), PLAIN, atol=tolerance if "normalised" in encoding else 2e-6)
 
 
 def test_a_signed_integer_at_its_very_least_is_minus_one():
@@ -271,10 +271,10 @@ def change(path, value):
     """Sets a value deep inside the JSON document of the plain file."""
 
     def build(document):
-        place = document.tree
+        container = document.tree
         for key in path[:-1]:
-            place = place[key]
-        place[path[-1]] = value
+            container = container[key]
+        container[path[-1]] = value
 
     return build
 
@@ -307,7 +307,7 @@ def test_a_document_that_contradicts_itself_is_refused_in_words(words):
 
 
 @pytest.mark.parametrize("words", ["no header", "version 1", "no whole JSON", "bytes of JSON"])
-def test_what_is_no_glb_file_of_gltf_2_is_refused(words):
+def test_files_other_than_glb_of_gltf_2_are_refused(words):
     document = Document()
     tetrahedron(document)
     data = document.bytes(asset={"version": "2.0", "extras": "x" * (5 << 20)} if words == "bytes of JSON" else {})
@@ -316,7 +316,7 @@ def test_what_is_no_glb_file_of_gltf_2_is_refused(words):
         parse_glb(changed.get(words, data), "a.glb")
 
 
-def test_faces_know_their_node_and_the_branch_of_the_tree_it_is_in():
+def test_faces_have_their_node_and_the_branch_of_the_tree_with_it():
     """root > model > (body, lid > knob): the tree divides below "model"."""
     document = Document()
     body, knob = tetrahedron(document, name="body"), tetrahedron(document, name="knob")
@@ -329,7 +329,7 @@ def test_faces_know_their_node_and_the_branch_of_the_tree_it_is_in():
     assert [glb.names[number] for number in glb.branch[::4]] == ["body", "lid", "lid"]
 
 
-def test_a_node_that_divides_the_tree_is_a_branch_of_its_own():
+def test_a_fork_with_a_mesh_is_a_separate_branch():
     document = Document()
     plate, knob = tetrahedron(document, name="plate"), tetrahedron(document, name="knob")
     lid = document.node(name="lid", children=[plate, knob])

@@ -32,11 +32,11 @@ def divided_cube(holes_m: float = 0.0) -> ObjectModel:
     for _ in range(3):
         box = box.subdivide()
     part = (box.vertices[:, 2] > holes_m + 1e-9).astype(np.uint8)
-    return ObjectModel("cube", np.array(box.vertices), np.array(box.faces), part, ALONG_X)
+    return ObjectModel("cube", np.array(box.vertices), np.array(box.faces), part=part, hinge=ALONG_X)
 
 
 def split_vertices(model: ObjectModel) -> ObjectModel:
-    """The same surface with vertices of their own for every triangle, as files with texture seams have them."""
+    """The same surface with separate vertices for each triangle, as in files with texture seams."""
     rows = model.faces.reshape(-1)
     part = model.part[rows]
     return replace(model, vertices_m=model.vertices_m[rows], part=part, faces=np.arange(len(rows)).reshape(-1, 3))
@@ -44,7 +44,7 @@ def split_vertices(model: ObjectModel) -> ObjectModel:
 
 def test_triangles_between_two_parts_belong_to_neither() -> None:
     faces = np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5]])
-    model = ObjectModel("strip", np.zeros((6, 3)), faces, np.array([0, 0, 0, 1, 1, 1], np.uint8), ALONG_X)
+    model = ObjectModel("strip", np.zeros((6, 3)), faces, part=np.array([0, 0, 0, 1, 1, 1], np.uint8), hinge=ALONG_X)
     assert model.face_part.tolist() == [0, SEAM, SEAM, 1]
     assert (model.seam_triangles, model.parts) == (2, [0, 1])
     assert replace(model, hinge=None).seam_triangles == 0
@@ -58,7 +58,7 @@ def test_corners_of_every_triangle_of_a_part_move_with_that_part() -> None:
 
 
 @pytest.mark.parametrize("model", [divided_cube(), split_vertices(divided_cube())], ids=["shared", "split vertices"])
-def test_a_part_is_closed_at_the_cut_whatever_its_size(model: ObjectModel) -> None:
+def test_a_cut_of_any_size_is_closed(model: ObjectModel) -> None:
     """The cut has 16 % of a part's surface. The base ends at the middle, the lid begins a layer above it."""
     expected = {0: SIDE_M**2 * SIDE_M / 2, 1: SIDE_M**2 * (SIDE_M / 2 - LAYER_M)}
     for part, volume in expected.items():
@@ -68,7 +68,7 @@ def test_a_part_is_closed_at_the_cut_whatever_its_size(model: ObjectModel) -> No
         assert is_closed(merged_surface(*model.closed_part(part)).faces)
 
 
-def test_the_closing_triangles_are_no_surface_but_bound_the_depth() -> None:
+def test_the_closing_triangles_affect_depths_but_not_distances() -> None:
     index = SurfaceIndex(divided_cube())
     cut, below = np.array([[[0.0, 0.0, 0.0]]]), np.array([[[0.0, 0.0, -0.01]]])
     closed = np.zeros(1)
@@ -146,9 +146,9 @@ def test_a_finger_inside_a_cut_part_is_in_contact_with_it() -> None:
 
 
 def test_quality_counts_the_seam_and_finds_both_parts_solid() -> None:
-    row = object_row(ObjectFacts.of(divided_cube()))
-    assert (row["solid"], row["watertight"], row["seam_triangles"]) == (True, True, 64)
-    assert row["open_edge_share"] == 0
+    facts = object_row(ObjectFacts.of(divided_cube()))
+    assert (facts["solid"], facts["watertight"], facts["seam_triangles"]) == (True, True, 64)
+    assert facts["open_edge_share"] == 0
 
 
 @pytest.mark.skipif(not ARCTIC, reason="HOIDATA_ARCTIC is not set: the meshes are not part of this repository")
@@ -158,7 +158,8 @@ def test_both_parts_of_every_arctic_object_are_solid_and_fill_the_whole_mesh() -
     assert len(folders) == 11
     for folder in folders:
         mesh, is_base = load_mesh(folder / "mesh.obj"), np.array(json.loads((folder / "parts.json").read_text()), bool)
-        model = ObjectModel(folder.name, mesh.vertices / 1000, mesh.faces, (~is_base).astype(np.uint8), ALONG_X)
+        part = (~is_base).astype(np.uint8)
+        model = ObjectModel(folder.name, mesh.vertices / 1000, mesh.faces, part=part, hinge=ALONG_X)
         assert all(isinstance(solid, Solid) for solid in model.solids.values()), folder.name
         parts = sum(mass.volume_m3 for mass in model.masses)
         whole = abs(volume_m3(*merged_surface(model.vertices_m, model.faces)))

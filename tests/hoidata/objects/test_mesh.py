@@ -54,14 +54,14 @@ WRITTEN_OTHERWISE = {
 }
 
 
-@pytest.mark.parametrize("way", WRITTEN_OTHERWISE)
-def test_a_mesh_written_otherwise_is_the_same_mesh(tmp_path: Path, way):
+@pytest.mark.parametrize("variant", WRITTEN_OTHERWISE)
+def test_variants_of_an_obj_file_give_the_same_mesh(tmp_path: Path, variant):
     ball = trimesh.creation.icosphere(1, radius=0.7)
     rows = [*(f"v {x!r} {y!r} {z!r}" for x, y, z in ball.vertices.tolist())]
     rows += [f"f {a} {b} {c}" for a, b, c in (ball.faces + 1).tolist()]
     plain, other = tmp_path / "plain.obj", tmp_path / "other.obj"
     plain.write_text("\n".join(rows) + "\n")
-    other.write_bytes(WRITTEN_OTHERWISE[way](plain.read_text()).encode())
+    other.write_bytes(WRITTEN_OTHERWISE[variant](plain.read_text()).encode())
     read = load_mesh(plain)
     np.testing.assert_array_equal(read.vertices, ball.vertices)
     np.testing.assert_array_equal(read.faces, ball.faces)
@@ -150,7 +150,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_bad_mesh_is_named_with_what_was_expected(tmp_path: Path, name):
+def test_the_error_of_a_bad_mesh_has_its_name_and_the_expected_content(tmp_path: Path, name):
     text, expected = BAD[name]
     (tmp_path / name).write_text(text)
     with pytest.raises(BadInput) as caught:
@@ -160,33 +160,33 @@ def test_a_bad_mesh_is_named_with_what_was_expected(tmp_path: Path, name):
     assert "\n" not in str(caught.value)
 
 
-def test_a_box_has_the_inertia_of_the_textbook_wherever_it_lies():
+def test_a_box_in_any_pose_has_the_inertia_of_the_textbook():
     a, b, c = 0.1, 0.2, 0.3
-    turn = Rotation.from_rotvec((0.3, -0.5, 0.9)).as_matrix()
+    rotation = Rotation.from_rotvec((0.3, -0.5, 0.9)).as_matrix()
     box = trimesh.creation.box((a, b, c))
-    facts = mass_properties(box.vertices @ turn.T + (0.4, -0.2, 1.0), box.faces)
-    expected = turn @ np.diag([b * b + c * c, a * a + c * c, a * a + b * b]) @ turn.T / 12
+    facts = mass_properties(box.vertices @ rotation.T + (0.4, -0.2, 1.0), box.faces)
+    expected = rotation @ np.diag([b * b + c * c, a * a + c * c, a * a + b * b]) @ rotation.T / 12
     assert facts.volume_m3 == pytest.approx(a * b * c)
     np.testing.assert_allclose(facts.centre_m, (0.4, -0.2, 1.0), atol=1e-12)
     np.testing.assert_allclose(facts.inertia_kg_m2, expected, atol=1e-12)
     assert facts.source == "solid"
 
 
-def test_a_mesh_turned_inside_out_is_the_same_solid():
+def test_an_inverted_mesh_has_the_same_mass_properties():
     ball = trimesh.creation.icosphere(radius=0.05)
     facts = mass_properties(ball.vertices, ball.faces[:, ::-1])
     assert facts.volume_m3 == pytest.approx(ball.volume)
     assert np.linalg.eigvalsh(facts.inertia_kg_m2).min() > 0
 
 
-def test_an_open_mesh_is_replaced_by_its_hull_and_says_so():
+def test_the_hull_replaces_an_open_mesh_and_is_reported():
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     facts = mass_properties(box.vertices, box.faces[2:])
     assert facts.source == "convex hull"
     assert facts.volume_m3 == pytest.approx(0.001)
 
 
-def test_two_shells_that_enclose_next_to_nothing_are_replaced_by_their_hull():
+def test_the_hull_replaces_two_shells_that_enclose_almost_nothing():
     outer, inner = trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.09999, 0.09999, 0.09999))
     vertices = np.concatenate([outer.vertices, inner.vertices])
     facts = mass_properties(vertices, np.concatenate([outer.faces, inner.faces[:, ::-1] + len(outer.vertices)]))
@@ -205,7 +205,7 @@ def test_a_thin_solid_across_its_box_is_one():
 
 def test_a_single_triangle_has_no_volume_and_no_inertia():
     corners = np.array([[0.0, 0, 0], [0.3, 0, 0], [0, 0.3, 0]])
-    found = mass_properties(corners, np.array([[0, 1, 2]]))
-    assert (found.volume_m3, found.source) == (0, "convex hull")
-    np.testing.assert_allclose(found.centre_m, (0.1, 0.1, 0))
-    assert not found.inertia_kg_m2.any()
+    properties = mass_properties(corners, np.array([[0, 1, 2]]))
+    assert (properties.volume_m3, properties.source) == (0, "convex hull")
+    np.testing.assert_allclose(properties.centre_m, (0.1, 0.1, 0))
+    assert not properties.inertia_kg_m2.any()

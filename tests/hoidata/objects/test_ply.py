@@ -26,15 +26,15 @@ FANS = [[0, 1, 2], [2, 1, 3], [4, 0, 1], [4, 1, 2], [0, 1, 2], [0, 2, 3], [0, 3,
 
 
 def text(n_vertices=5, n_faces=5) -> bytes:
-    rows = [" ".join(map(str, row)) for row in VERTICES]
-    rows += [" ".join(map(str, (1, len(face), *face, 2, 0.5, 0.25))) for face in FACES]
-    return (HEAD.format("ascii", n_vertices, n_faces, "int") + "\n".join(rows) + "\n").encode()
+    lines = [" ".join(map(str, values)) for values in VERTICES]
+    lines += [" ".join(map(str, (1, len(face), *face, 2, 0.5, 0.25))) for face in FACES]
+    return (HEAD.format("ascii", n_vertices, n_faces, "int") + "\n".join(lines) + "\n").encode()
 
 
 def binary(order="<", n_vertices=5, n_faces=5, corner="uint") -> bytes:
     name = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
     letter = {"uint": "I", "short": "h", "uchar": "B", "float": "f"}[corner]
-    body = b"".join(struct.pack(f"{order}fBdi", *row) for row in VERTICES)
+    body = b"".join(struct.pack(f"{order}fBdi", *values) for values in VERTICES)
     for face in FACES:
         body += struct.pack(f"{order}BB{len(face)}{letter}Hff", 1, len(face), *face, 2, 0.5, 0.25)
     return HEAD.format(name, n_vertices, n_faces, corner).encode() + body
@@ -53,7 +53,7 @@ def test_mixed_polygons_among_other_properties_are_read_as_stored_and_become_fan
 
 
 @pytest.mark.parametrize("kind", FILES)
-def test_every_shorter_file_is_refused(kind):
+def test_truncated_files_are_refused(kind):
     data = FILES[kind]
     for length in range(len(data) - 12):
         with pytest.raises(ValueError, match=r"."):
@@ -65,7 +65,7 @@ def test_every_shorter_file_is_refused(kind):
     [text(n_vertices=10**9), text(n_faces=10**9), binary(n_vertices=10**9), binary(n_faces=10**10)],
     ids=["text vertices", "text faces", "vertices", "faces"],
 )
-def test_a_billion_declared_rows_are_refused_at_once(data):
+def test_a_billion_declared_rows_are_refused_immediately(data):
     with pytest.raises(ValueError, match="more than 1000000 vertices or 3000000 triangles"):
         parse_ply(data)
 
@@ -100,7 +100,7 @@ def test_headers_and_rows_that_make_no_mesh_are_refused(old, new):
 
 @pytest.mark.parametrize("kind", ["text", "binary"])
 def test_a_mesh_whose_polygons_change_at_every_row_is_read_in_less_than_a_second(kind):
-    """Each block of equal rows used to be read on its own: these 60,000 faces took eight seconds."""
+    """A reader of one block of equal rows at a time takes eight seconds for these 60,000 faces."""
     lengths = np.tile([3, 4, 3, 5], 15_000)
     faces = [np.arange(length) for length in lengths]
     head = (
@@ -119,6 +119,6 @@ def test_a_mesh_whose_polygons_change_at_every_row_is_read_in_less_than_a_second
     assert len(triangles) == (lengths - 2).sum()
 
 
-def test_what_follows_the_faces_of_a_text_may_be_anything():
+def test_text_after_the_faces_is_ignored():
     data = FILES["text"].replace(b"end_header", b"element more 1\nproperty int a\nend_header") + b"no number"
     assert parse_ply(data)[1].tolist() == FANS

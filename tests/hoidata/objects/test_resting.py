@@ -13,10 +13,10 @@ def downs(mesh: trimesh.Trimesh) -> np.ndarray:
     return footing(np.asarray(mesh.vertices), np.asarray(mesh.faces)).downs
 
 
-def same_directions(found: np.ndarray, expected: np.ndarray, tolerance_deg: float = 1e-4) -> bool:
-    if len(found) != len(expected):
+def same_directions(actual: np.ndarray, expected: np.ndarray, tolerance_deg: float = 1e-4) -> bool:
+    if len(actual) != len(expected):
         return False
-    cosine = np.clip(found @ np.asarray(expected, dtype=float).T, -1, 1)
+    cosine = np.clip(actual @ np.asarray(expected, dtype=float).T, -1, 1)
     return bool((np.rad2deg(np.arccos(cosine)).min(axis=0) <= tolerance_deg).all())
 
 
@@ -27,7 +27,7 @@ def test_a_box_stands_on_each_of_its_six_sides():
     assert same_directions(downs(trimesh.creation.box((0.05, 0.08, 0.12))), AXES)
 
 
-def test_a_can_stands_on_its_two_ends_and_rolls_on_its_mantle():
+def test_a_can_stands_on_its_two_ends_and_rolls_on_its_side():
     assert same_directions(downs(trimesh.creation.cylinder(0.037, 0.13, sections=42)), AXES[[2, 5]])
 
 
@@ -35,7 +35,7 @@ def test_a_prism_of_six_sides_does_not_roll():
     assert len(downs(trimesh.creation.cylinder(0.05, 0.1, sections=6))) == 8
 
 
-def test_a_ball_stands_nowhere():
+def test_a_ball_has_no_resting_pose():
     assert downs(trimesh.creation.icosphere(3, 0.05)).shape == (0, 3)
 
 
@@ -52,7 +52,7 @@ def test_a_slanted_body_does_not_stand_on_a_foot_its_weight_is_not_above():
     assert (np.abs(downs(mesh)[:, 2]) > 0.999).sum() == 2
 
 
-def test_an_open_or_flat_mesh_is_no_error():
+def test_an_open_or_flat_mesh_raises_no_error():
     flat = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], dtype=float)
     assert footing(flat, np.array([[0, 1, 2], [1, 3, 2]])).downs.shape == (0, 3)
     box = trimesh.creation.box((0.05, 0.08, 0.12))
@@ -67,8 +67,8 @@ def test_a_scanned_underside_that_is_not_flat_is_one_side():
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**31 - 1))
-def test_the_sides_turn_with_the_mesh(seed):
-    turn = Rotation.random(random_state=np.random.default_rng(seed)).as_matrix()
+def test_the_sides_rotate_with_the_mesh(seed):
+    rotation = Rotation.random(random_state=np.random.default_rng(seed)).as_matrix()
     mesh = trimesh.creation.box((0.05, 0.08, 0.12))
-    turned = footing(np.asarray(mesh.vertices) @ turn.T + 0.3, np.asarray(mesh.faces))
-    assert same_directions(turned.downs, AXES @ turn.T)
+    turned = footing(np.asarray(mesh.vertices) @ rotation.T + 0.3, np.asarray(mesh.faces))
+    assert same_directions(turned.downs, AXES @ rotation.T)

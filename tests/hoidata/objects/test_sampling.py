@@ -50,8 +50,8 @@ def test_a_fine_mesh_is_sampled_at_its_vertices_from_the_first() -> None:
     points = sample_points(model)
     assert points.method == "vertices-fps"
     np.testing.assert_array_equal(points.points_m[0], sphere.vertices[0].astype(np.float32))
-    known = {tuple(vertex) for vertex in sphere.vertices.astype(np.float32)}
-    assert {tuple(point) for point in points.points_m} <= known
+    vertices = {tuple(vertex) for vertex in sphere.vertices.astype(np.float32)}
+    assert {tuple(point) for point in points.points_m} <= vertices
     np.testing.assert_allclose(from_barycentric(model, points), points.points_m, atol=1e-7)
     np.testing.assert_allclose(points.normals, points.points_m / 0.05, atol=0.01)
 
@@ -119,16 +119,16 @@ def test_vertices_serve_from_1024_of_them_and_up_to_edges_of_2_cm(columns, rows,
     assert sample_points(grid(columns, rows, longest_edge_m)).method == method
 
 
-def test_vertices_at_the_seam_of_two_parts_take_a_face_of_their_own() -> None:
+def test_vertices_at_the_seam_of_two_parts_take_a_face_of_their_part() -> None:
     sphere = trimesh.creation.icosphere(4, radius=0.05)
     part = (sphere.vertices[:, 2] > 0).astype(np.uint8)
-    model = ObjectModel("split", np.array(sphere.vertices), np.array(sphere.faces), part, UP)
+    model = ObjectModel("split", np.array(sphere.vertices), np.array(sphere.faces), part=part, hinge=UP)
     points = sample_points(model)
     np.testing.assert_array_equal(points.part, points.points_m[:, 2] > 0)
     np.testing.assert_array_equal(model.face_part[points.face], points.part)
 
 
-def test_parts_that_lie_on_each_other_keep_their_own_normals() -> None:
+def test_touching_parts_keep_separate_normals() -> None:
     sphere = trimesh.creation.icosphere(4, radius=0.05)
     lining = ObjectModel(
         "in", np.array(sphere.vertices), sphere.faces[:, ::-1], np.zeros(len(sphere.vertices), np.uint8)

@@ -20,12 +20,12 @@ def test_both_look_ups_give_the_exact_signed_distance_to_a_fraction_of_a_cell():
     assert exact_m.min() < -0.03
     search_m = grid_field(surface_index(model).filled[0])(points)
     fields = DistanceFields([("ball", model)], 40)
-    asked = torch.from_numpy(points[None, None].astype(np.float32))
-    torch_m, offset_m = fields.query(torch.zeros(1, dtype=torch.long), asked, torch.zeros(1, 1))
+    queries = torch.from_numpy(points[None, None].astype(np.float32))
+    torch_m, offset_m = fields.query(torch.zeros(1, dtype=torch.long), queries, torch.zeros(1, 1))
     far = np.abs(exact_m) < 0.03  # the offset jumps in the middle of the ball
     near = far & (exact_m < 0.01)  # the grid of the search reaches 1 cm, that of losses 3 cm
-    for found, asked_m in ((search_m, near), (torch_m[0, 0].numpy(), far)):
-        np.testing.assert_allclose(found[asked_m], exact_m[asked_m], atol=4e-4)
+    for distance_m, expected_m in ((search_m, near), (torch_m[0, 0].numpy(), far)):
+        np.testing.assert_allclose(distance_m[expected_m], exact_m[expected_m], atol=4e-4)
     off = exact_m > 0.01  # a lower bound, by at most the root of two
     assert (search_m[off] < exact_m[off] + 4e-4).all()
     assert (search_m[off] > exact_m[off] / np.sqrt(2) - 4e-4).all()
@@ -37,9 +37,9 @@ def test_both_look_ups_give_the_exact_signed_distance_to_a_fraction_of_a_cell():
 def test_beyond_the_grid_the_torch_look_up_goes_on_and_the_search_s_stays_below():
     vertices, faces = sphere(0.05, 40)
     model = ObjectModel("ball", vertices, faces, np.zeros(len(vertices), np.uint8))
-    asked = torch.tensor([[[[0.3, 0.0, 0.0]]]])
+    query = torch.tensor([[[[0.3, 0.0, 0.0]]]])
     distance, offset = DistanceFields([("ball", model)], 40).query(
-        torch.zeros(1, dtype=torch.long), asked, torch.zeros(1, 1)
+        torch.zeros(1, dtype=torch.long), query, torch.zeros(1, 1)
     )
     np.testing.assert_allclose(distance, [[[0.25]]], atol=1e-3)
     np.testing.assert_allclose(offset, [[[[-0.25, 0, 0]]]], atol=1e-3)

@@ -21,8 +21,8 @@ OUTER_M, INNER_M, HEIGHT_M, FLOOR_M, SECTIONS = 0.04, 0.035, 0.1, 0.008, 720
 AT_ONCE, NEVER = 0, 10**12
 
 
-def solid_index(vertices: np.ndarray, faces: np.ndarray, grid_from: int = NEVER) -> SurfaceIndex:
-    return SurfaceIndex(model_of(trimesh.Trimesh(vertices, faces, process=False)), grid_from)
+def solid_index(vertices: np.ndarray, faces: np.ndarray, grid_after: int = NEVER) -> SurfaceIndex:
+    return SurfaceIndex(model_of(trimesh.Trimesh(vertices, faces, process=False)), grid_after)
 
 
 def analytic_mug() -> trimesh.Trimesh:
@@ -38,19 +38,19 @@ def mug_depth(places: np.ndarray) -> np.ndarray:
     in_floor = (radius <= INNER_M) & (height > 0) & (height < FLOOR_M)
     edges = [((0, 0), (OUTER_M, 0)), ((OUTER_M, 0), (OUTER_M, HEIGHT_M)), ((OUTER_M, HEIGHT_M), (INNER_M, HEIGHT_M))]
     edges += [((INNER_M, HEIGHT_M), (INNER_M, FLOOR_M)), ((INNER_M, FLOOR_M), (0, FLOOR_M))]
-    place, distance = np.stack([radius, height], axis=1), np.full(len(places), np.inf)
+    points, distance = np.stack([radius, height], axis=1), np.full(len(places), np.inf)
     for start, stop in edges:
-        way = np.subtract(stop, start)
-        along = np.clip((place - start) @ way / (way @ way), 0, 1)
-        distance = np.minimum(distance, np.linalg.norm(place - start - along[:, None] * way, axis=1))
+        edge = np.subtract(stop, start)
+        along = np.clip((points - start) @ edge / (edge @ edge), 0, 1)
+        distance = np.minimum(distance, np.linalg.norm(points - start - along[:, None] * edge, axis=1))
     return np.where(in_wall | in_floor, distance, 0.0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("grid_from", [AT_ONCE, NEVER], ids=["grid", "no grid"])
-def test_the_cavity_of_a_mug_is_outside_and_its_wall_inside(grid_from: int) -> None:
+@pytest.mark.parametrize("grid_after", [AT_ONCE, NEVER], ids=["grid", "no grid"])
+def test_the_cavity_of_a_mug_is_outside_and_its_wall_inside(grid_after: int) -> None:
     mug, rng = analytic_mug(), np.random.default_rng(0)
-    index = solid_index(mug.vertices, mug.faces, grid_from)
+    index = solid_index(mug.vertices, mug.faces, grid_after)
     assert index.solid_note is None
     places = rng.uniform((-0.05, -0.05, -0.01), (0.05, 0.05, 0.11), (20_000, 3))
     expected = mug_depth(places)
@@ -62,12 +62,12 @@ def test_the_cavity_of_a_mug_is_outside_and_its_wall_inside(grid_from: int) -> N
 
 
 def test_lines_through_edges_and_corners_keep_their_count() -> None:
-    """Places straight beside edges and corners of a box: the line along x runs along edges and through corners."""
+    """Points in line with edges and corners of a box, so that the line along x runs along edges and through corners."""
     box = trimesh.creation.box((0.5, 0.5, 0.5))
     steps = np.array([-0.375, -0.25, 0.0, 0.25, 0.375])
     places = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
-    for grid_from in (AT_ONCE, NEVER):
-        depth = solid_index(box.vertices, box.faces, grid_from).depth_m(places[None], None)[0]
+    for grid_after in (AT_ONCE, NEVER):
+        depth = solid_index(box.vertices, box.faces, grid_after).depth_m(places[None], None)[0]
         np.testing.assert_allclose(depth, np.maximum(0.25 - np.abs(places).max(axis=1), 0), atol=1e-15)
 
 
@@ -75,13 +75,13 @@ def test_a_line_through_the_tips_of_an_octahedron_enters_and_leaves_it_once() ->
     tips = 0.25 * np.concatenate([np.eye(3), -np.eye(3)])
     hull = trimesh.Trimesh(tips, process=False).convex_hull
     places = np.array([[0.1, 0, 0], [-0.2, 0, 0], [0.3, 0, 0], [0, 0.125, 0], [0, 0.125, 0.0625], [-0.3, 0, 0]])
-    for grid_from in (AT_ONCE, NEVER):
-        depth = solid_index(hull.vertices, hull.faces, grid_from).depth_m(places[None], None)[0]
+    for grid_after in (AT_ONCE, NEVER):
+        depth = solid_index(hull.vertices, hull.faces, grid_after).depth_m(places[None], None)[0]
         expected = np.maximum(0.25 - np.abs(places).sum(axis=1), 0) / np.sqrt(3)
         np.testing.assert_allclose(depth, expected, atol=1e-15)
 
 
-def test_shells_that_overlap_are_one_solid_and_a_shell_turned_inwards_is_a_cavity() -> None:
+def test_overlapping_shells_are_one_solid_and_an_inverted_shell_is_a_cavity() -> None:
     one, two = trimesh.creation.box((0.2, 0.1, 0.1)), trimesh.creation.box((0.2, 0.1, 0.1))
     two.vertices += (0.1, 0.0201, 0.0101)
     hollow = trimesh.creation.box((0.4, 0.4, 0.4))
@@ -93,20 +93,20 @@ def test_shells_that_overlap_are_one_solid_and_a_shell_turned_inwards_is_a_cavit
     places = rng.uniform(-0.25, 0.25, (5000, 3))
     in_either = sum((np.abs(places - at) < (0.1, 0.05, 0.05)).all(axis=1) for at in ((0, 0, 0), (0.1, 0.0201, 0.0101)))
     in_hollow = (np.abs(places) < 0.2).all(axis=1) & ~(np.abs(places) < 0.1).all(axis=1)
-    for grid_from in (AT_ONCE, NEVER):
-        depth = solid_index(both.vertices, both.faces, grid_from).depth_m(places[None], None)[0]
+    for grid_after in (AT_ONCE, NEVER):
+        depth = solid_index(both.vertices, both.faces, grid_after).depth_m(places[None], None)[0]
         np.testing.assert_array_equal(depth > 0, in_either > 0)
-        depth = solid_index(vertices, faces, grid_from).depth_m(places[None], None)[0]
+        depth = solid_index(vertices, faces, grid_after).depth_m(places[None], None)[0]
         np.testing.assert_array_equal(depth > 0, in_hollow)
 
 
-def test_a_small_hole_is_closed_and_said() -> None:
+def test_a_small_hole_is_closed_and_reported() -> None:
     sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
     index = solid_index(sphere.vertices, sphere.faces[1:])
     assert index.solid_note == "object: 1 small hole closed"
     places = np.array([[[0, 0, 0], [0, 0, 0.06], [0, 0, 0.03]]])
     np.testing.assert_allclose(index.depth_m(places, None)[0], [0.05, 0, 0.02], atol=5e-4)
-    # The patch is no surface: seen through the hole, the nearest triangle is the one beside it.
+    # The patch is not part of the surface: at the hole, the nearest triangle is next to it.
     middle = sphere.vertices[sphere.faces[0]].mean(axis=0)
     assert index.distance_m(middle[None, None], None)[0, 0] > 0.001
 
@@ -134,11 +134,11 @@ def test_a_surface_drawn_once_for_each_side_becomes_the_solid_inside_it() -> Non
     """As ManipNet's mug2."""
     torus = trimesh.creation.torus(0.05, 0.02)
     for faces in (torus.faces, torus.faces[:, ::-1]):
-        found = solid_of(np.array(torus.vertices), np.concatenate([faces, faces[::-1, ::-1]]))
-        assert isinstance(found, Solid)
-        assert found.repairs.startswith(f"{len(torus.faces)} triangles that lay double left out")
-        assert volume_m3(found.vertices_m, found.faces) == pytest.approx(torus.volume, rel=1e-12)
-        assert not found.patched
+        solid = solid_of(np.array(torus.vertices), np.concatenate([faces, faces[::-1, ::-1]]))
+        assert isinstance(solid, Solid)
+        assert solid.repairs.startswith(f"{len(torus.faces)} triangles that lay double left out")
+        assert volume_m3(solid.vertices_m, solid.faces) == pytest.approx(torus.volume, rel=1e-12)
+        assert not solid.patched
 
 
 @pytest.mark.parametrize(
@@ -146,14 +146,14 @@ def test_a_surface_drawn_once_for_each_side_becomes_the_solid_inside_it() -> Non
     [(slice(None), "triangles turned outward"), (slice(0, None, 3), "neighbouring triangles turned alike")],
     ids=["inside out", "unevenly turned"],
 )
-def test_triangles_turned_the_wrong_way_are_turned_back_and_it_is_said(which: slice, said: str) -> None:
+def test_inverted_triangles_are_flipped_and_reported(which: slice, said: str) -> None:
     box = trimesh.creation.box((0.1, 0.2, 0.3))
     faces = np.array(box.faces)
     faces[which] = faces[which, ::-1]
-    found = solid_of(np.array(box.vertices), faces)
-    assert isinstance(found, Solid)
-    assert found.repairs.startswith(said)
-    assert volume_m3(found.vertices_m, found.faces) == pytest.approx(0.006)
+    solid = solid_of(np.array(box.vertices), faces)
+    assert isinstance(solid, Solid)
+    assert solid.repairs.startswith(said)
+    assert volume_m3(solid.vertices_m, solid.faces) == pytest.approx(0.006)
 
 
 @pytest.mark.parametrize(("wall_m", "is_solid"), [(1e-4, True), (1e-5, False)])
@@ -162,8 +162,8 @@ def test_a_cup_as_thin_as_paper_is_solid_and_two_sheets_a_hundredth_of_a_millime
 ) -> None:
     profile = [(0, 0), (0.04, 0), (0.04, 0.1), (0.04 - wall_m, 0.1), (0.04 - wall_m, wall_m), (0, wall_m)]
     cup = trimesh.creation.revolve(np.array(profile))
-    found = solid_of(np.array(cup.vertices), np.array(cup.faces))
-    assert isinstance(found, Solid) if is_solid else found == NoSolid("it encloses nothing")
+    solid = solid_of(np.array(cup.vertices), np.array(cup.faces))
+    assert isinstance(solid, Solid) if is_solid else solid == NoSolid("it encloses nothing")
 
 
 def test_a_thin_rod_askew_is_solid_though_it_fills_less_than_a_thousandth_of_its_box() -> None:
@@ -184,8 +184,8 @@ def test_a_closed_surface_with_one_side_only_is_refused() -> None:
 def test_triangles_that_do_not_meet_two_by_two_are_refused() -> None:
     box = trimesh.creation.box((0.1, 0.2, 0.3))
     fin = np.concatenate([box.vertices, [[0.5, 0.5, 0.5]]])
-    found = solid_of(fin, np.concatenate([box.faces, [[box.faces[0, 0], box.faces[0, 1], 8]]]))
-    assert isinstance(found, NoSolid)
+    solid = solid_of(fin, np.concatenate([box.faces, [[box.faces[0, 0], box.faces[0, 1], 8]]]))
+    assert isinstance(solid, NoSolid)
 
 
 def test_any_hole_can_be_closed_by_a_fan_in_every_pose() -> None:
@@ -193,8 +193,8 @@ def test_any_hole_can_be_closed_by_a_fan_in_every_pose() -> None:
     open_faces = tube.faces[np.abs(tube.face_normals[:, 2]) < 0.5]
     poses = np.stack([tube.vertices, 2 * tube.vertices])
     places, closed = patched_holes(poses, open_faces)
-    for scale, own in zip((1, 8), places, strict=True):
-        assert volume_m3(own, closed) == pytest.approx(scale * tube.volume, rel=1e-9)
+    for scale, queries in zip((1, 8), places, strict=True):
+        assert volume_m3(queries, closed) == pytest.approx(scale * tube.volume, rel=1e-9)
 
 
 @pytest.mark.skipif(not ROOT, reason="HOIDATA_MANIPNET is not set: the meshes are not part of this repository")

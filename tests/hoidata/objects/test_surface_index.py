@@ -2,6 +2,7 @@
 
 import gzip
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import igl
@@ -47,8 +48,8 @@ def queries(vertices_m: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
     away = rng.normal(size=corners.shape)
     away *= rng.uniform(0, 2 * THRESHOLD_M, (len(corners), 1)) / np.linalg.norm(away, axis=1, keepdims=True)
     along = corners[rng.permutation(len(corners))]
-    share = np.where(rng.random((len(corners), 1)) < 0.5, 0, rng.random((len(corners), 1)))
-    return np.concatenate([spread, corners + share * (along - corners) + away])
+    weight = np.where(rng.random((len(corners), 1)) < 0.5, 0, rng.random((len(corners), 1)))
+    return np.concatenate([spread, corners + weight * (along - corners) + away])
 
 
 def igl_distance(model: ObjectModel, places_m: np.ndarray) -> np.ndarray:
@@ -60,11 +61,11 @@ def brute_distance(corners_m: np.ndarray, places_m: np.ndarray) -> np.ndarray:
     a = corners_m[None]
     best = np.full((len(places_m), len(corners_m)), np.inf)
     for start, stop in ((0, 1), (1, 2), (2, 0)):
-        way = a[:, :, stop] - a[:, :, start]
+        edge = a[:, :, stop] - a[:, :, start]
         from_start = places_m[:, None] - a[:, :, start]
-        square = (way**2).sum(-1)
-        along = np.clip((from_start * way).sum(-1) / np.where(square > 0, square, 1), 0, 1)
-        best = np.minimum(best, np.linalg.norm(from_start - along[..., None] * way, axis=-1))
+        square = (edge**2).sum(-1)
+        along = np.clip((from_start * edge).sum(-1) / np.where(square > 0, square, 1), 0, 1)
+        best = np.minimum(best, np.linalg.norm(from_start - along[..., None] * edge, axis=-1))
     normal = np.cross(a[:, :, 1] - a[:, :, 0], a[:, :, 2] - a[:, :, 0])
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = normal / np.where(length > 0, length, 1)
@@ -81,11 +82,11 @@ def has_grids(index: SurfaceIndex) -> bool:
     return all(surface.has_grid for surface in index._surfaces.values())
 
 
-@pytest.mark.parametrize("grid_from", [AT_ONCE, NEVER], ids=["grid", "no grid"])
+@pytest.mark.parametrize("grid_after", [AT_ONCE, NEVER], ids=["grid", "no grid"])
 @pytest.mark.parametrize("name", MESHES)
-def test_labels_and_distances_equal_libigl_s(name: str, grid_from: int) -> None:
+def test_labels_and_distances_equal_libigl_s(name: str, grid_after: int) -> None:
     model = model_of(MESHES[name])
-    index, places = SurfaceIndex(model, grid_from), queries(model.vertices_m, 24_000)
+    index, places = SurfaceIndex(model, grid_after), queries(model.vertices_m, 24_000)
     expected = igl_distance(model, places)
     assert (np.abs(expected - THRESHOLD_M) < 0.002).mean() > 0.1
     clear = np.abs(expected - THRESHOLD_M) > CLEAR_M
@@ -94,13 +95,13 @@ def test_labels_and_distances_equal_libigl_s(name: str, grid_from: int) -> None:
         (expected < THRESHOLD_M)[clear], index.within(places[None], None, THRESHOLD_M)[0][clear]
     )
     np.testing.assert_allclose(index.distance_m(places[None], None)[0], expected, atol=1e-14)
-    assert has_grids(index) == (grid_from == AT_ONCE)
+    assert has_grids(index) == (grid_after == AT_ONCE)
     near = index.distance_m(places[None], None, 0.02)[0]
     np.testing.assert_array_equal(np.isinf(near), expected > 0.02)
     np.testing.assert_allclose(near[expected <= 0.02], expected[expected <= 0.02], atol=1e-14)
 
 
-def test_distances_to_triangles_of_every_bad_shape_equal_brute_force() -> None:
+def test_distances_to_degenerate_triangles_equal_brute_force() -> None:
     """On a coarse lattice triangles collapse to segments, coincide, cross, and places lie on them."""
     rng = np.random.default_rng(3)
     for _ in range(20):
@@ -112,16 +113,16 @@ def test_distances_to_triangles_of_every_bad_shape_equal_brute_force() -> None:
             continue
         places = np.concatenate([rng.integers(-2, 6, (60, 3)) * 0.01, rng.uniform(-0.02, 0.08, (60, 3))])
         expected = brute_distance(corners[faces[distinct]], places)
-        for grid_from in (AT_ONCE, NEVER):
-            index = SurfaceIndex(model, grid_from)
-            found = index.distance_m(places[None], None)[0]
-            np.testing.assert_allclose(found, expected, atol=1e-14)
+        for grid_after in (AT_ONCE, NEVER):
+            index = SurfaceIndex(model, grid_after)
+            distance_m = index.distance_m(places[None], None)[0]
+            np.testing.assert_allclose(distance_m, expected, atol=1e-14)
             for threshold_m in (0.01, 0.02, 1e-9):
                 within = index.within(places[None], None, threshold_m)[0]
-                np.testing.assert_array_equal(within, found < threshold_m)
+                np.testing.assert_array_equal(within, distance_m < threshold_m)
 
 
-def test_a_grid_changes_no_bit_of_any_answer() -> None:
+def test_a_grid_changes_no_bit_of_the_results() -> None:
     model = model_of(MESHES["bumpy torus"])
     with_grid, without = SurfaceIndex(model, AT_ONCE), SurfaceIndex(model, NEVER)
     places = queries(model.vertices_m, 5000, seed=2)[None]
@@ -133,11 +134,11 @@ def test_a_grid_changes_no_bit_of_any_answer() -> None:
         )
 
 
-def test_a_distance_equal_to_the_threshold_is_not_within_and_one_equal_to_the_most_is_kept() -> None:
+def test_the_threshold_is_exclusive_and_the_maximum_inclusive() -> None:
     model = model_of(trimesh.creation.box((0.5, 0.5, 0.5)))
     places = np.array([[[0.0, 0.0, 0.5], [0.0, 0.0, 0.25]]])
-    for grid_from in (AT_ONCE, NEVER):
-        index = SurfaceIndex(model, grid_from)
+    for grid_after in (AT_ONCE, NEVER):
+        index = SurfaceIndex(model, grid_after)
         np.testing.assert_array_equal(index.within(places, None, 0.25), [[False, True]])
         np.testing.assert_array_equal(index.distance_m(places, None, 0.25), [[0.25, 0]])
         np.testing.assert_array_equal(index.distance_m(places, None, 0.0), [[np.inf, 0]])
@@ -151,20 +152,20 @@ def laptop() -> ObjectModel:
     return two_parts(base, lid, tuple(axis), (0, 0.075, 0.006), "laptop")
 
 
-@pytest.mark.parametrize("grid_from", [AT_ONCE, NEVER], ids=["grid", "no grid"])
-def test_articulated_parts_are_right_at_every_angle(grid_from: int) -> None:
+@pytest.mark.parametrize("grid_after", [AT_ONCE, NEVER], ids=["grid", "no grid"])
+def test_distances_and_depths_of_parts_are_right_at_all_angles(grid_after: int) -> None:
     model, angles = laptop(), np.linspace(-2.5, 4, 40)
     posed = articulate(model.vertices_m, model.part, model.hinge, angles)
     places = np.stack([queries(vertices, 300, seed) for seed, vertices in enumerate(posed)])
-    index = SurfaceIndex(model, grid_from)
+    index = SurfaceIndex(model, grid_after)
     for ask in (index.distance_m, index.depth_m):
         assert np.ptp(ask(places, angles), axis=1).min() > 0
-    found, inside = index.distance_m(places, angles), index.depth_m(places, angles)
+    distance_m, inside = index.distance_m(places, angles), index.depth_m(places, angles)
     within = index.within(places, angles, THRESHOLD_M)
     for frame, vertices in enumerate(posed):
         whole = ObjectModel("posed", vertices, model.faces, model.part)
         expected = igl_distance(whole, places[frame])
-        np.testing.assert_allclose(found[frame], expected, atol=1e-12)
+        np.testing.assert_allclose(distance_m[frame], expected, atol=1e-12)
         np.testing.assert_array_equal(within[frame], expected < THRESHOLD_M)
         signed = [
             igl.signed_distance(places[frame], vertices, model.faces[model.face_part == part].astype(np.int64))[0]
@@ -178,21 +179,21 @@ def test_an_articulated_object_without_angles_is_refused() -> None:
         SurfaceIndex(laptop()).within(np.zeros((1, 1, 3)), None, THRESHOLD_M)
 
 
-def test_answers_do_not_change_when_object_and_places_move_or_are_mirrored() -> None:
+def test_results_are_unchanged_when_object_and_points_move_or_are_mirrored() -> None:
     mesh = MESHES["cone"]
     places = queries(np.array(mesh.vertices), 3000, seed=5)
     plain = SurfaceIndex(model_of(mesh))
     distance, depth = plain.distance_m(places[None], None), plain.depth_m(places[None], None)
-    turn, part = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix(), np.zeros(len(mesh.vertices), np.uint8)
-    moved = ObjectModel("moved", mesh.vertices @ turn.T + [1, 2, -0.5], np.array(mesh.faces), part)
+    rotation, part = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix(), np.zeros(len(mesh.vertices), np.uint8)
+    moved = ObjectModel("moved", mesh.vertices @ rotation.T + [1, 2, -0.5], np.array(mesh.faces), part)
     mirrored = ObjectModel("mirrored", mesh.vertices * [-1, 1, 1], mesh.faces[:, ::-1], part)
     assert depth.any()
-    for model, own in ((moved, places @ turn.T + [1, 2, -0.5]), (mirrored, places * [-1, 1, 1])):
-        np.testing.assert_allclose(SurfaceIndex(model).distance_m(own[None], None), distance, atol=1e-14)
-        np.testing.assert_allclose(SurfaceIndex(model).depth_m(own[None], None), depth, atol=1e-14)
+    for model, positions in ((moved, places @ rotation.T + [1, 2, -0.5]), (mirrored, places * [-1, 1, 1])):
+        np.testing.assert_allclose(SurfaceIndex(model).distance_m(positions[None], None), distance, atol=1e-14)
+        np.testing.assert_allclose(SurfaceIndex(model).depth_m(positions[None], None), depth, atol=1e-14)
 
 
-def test_triangles_without_area_count_as_segments_and_places_without_numbers_are_nowhere() -> None:
+def test_triangles_without_area_are_segments_and_nan_points_are_infinitely_far() -> None:
     """A needle folded flat: its corners are distinct, its area is zero."""
     vertices = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.05, 0, 0], [0, 0.1, 0]])
     model = ObjectModel("flat", vertices, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(4, np.uint8))
@@ -202,19 +203,21 @@ def test_triangles_without_area_count_as_segments_and_places_without_numbers_are
     np.testing.assert_array_equal(index.within(places, None, 0.0035)[0], [True, False, False])
 
 
-def test_the_same_mesh_gives_the_same_index_and_another_hinge_or_part_another() -> None:
+def test_the_index_is_cached_by_mesh_hinge_and_parts() -> None:
     model = laptop()
-    again = ObjectModel(model.name, model.vertices_m.copy(), model.faces.copy(), model.part.copy(), model.hinge)
+    again = ObjectModel(
+        model.name, model.vertices_m.copy(), model.faces.copy(), part=model.part.copy(), hinge=model.hinge
+    )
     assert surface_index(model) is surface_index(again)
     assert model.hinge is not None
-    other = ObjectModel(model.name, model.vertices_m, model.faces, model.part, Hinge(model.hinge.axis, np.zeros(3)))
+    other = replace(model, hinge=Hinge(model.hinge.axis, np.zeros(3)))
     assert surface_index(other) is not surface_index(model)
-    swapped = ObjectModel(model.name, model.vertices_m, model.faces, 1 - model.part, model.hinge)
+    swapped = replace(model, part=1 - model.part)
     assert surface_index(swapped) is not surface_index(model)
 
 
-def test_only_indices_used_last_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hoidata.objects.surface_index.MOST_TRIANGLES_KEPT", 30)
+def test_only_recently_used_indices_are_cached(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hoidata.objects.surface_index.MAX_CACHED_TRIANGLES", 30)
     boxes = [model_of(trimesh.creation.box((0.1, 0.1, size)), f"box of {size}") for size in (0.1, 0.2, 0.3)]
     first, second = surface_index(boxes[0]), surface_index(boxes[1])
     assert surface_index(boxes[0]) is first
@@ -225,8 +228,8 @@ def test_only_indices_used_last_are_kept(monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.skipif(not ROOT, reason="HOIDATA_MANIPNET is not set: the meshes are not part of this repository")
 @pytest.mark.slow
-def test_every_label_and_depth_on_manipnet_s_meshes_equals_libigl_s() -> None:
-    asked = 0
+def test_contact_labels_and_depths_on_manipnet_s_meshes_equal_libigl_s() -> None:
+    n_queriesries = 0
     for path in sorted(Path(ROOT).glob("objects/*/*.obj.gz")):
         mesh = parse_obj(gzip.decompress(path.read_bytes()).decode(), path)
         model = ObjectModel(path.stem, 0.1 * mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), np.uint8))
@@ -241,35 +244,37 @@ def test_every_label_and_depth_on_manipnet_s_meshes_equals_libigl_s() -> None:
             np.testing.assert_array_equal(index.within(places[None], None, THRESHOLD_M)[0], expected < THRESHOLD_M)
             np.testing.assert_allclose(index.distance_m(places[None], None)[0], expected, atol=1e-12)
             np.testing.assert_allclose(index.depth_m(few[None], None)[0], np.where(inside, depth, 0), atol=1e-12)
-        asked += len(places)
-    assert asked >= 150_000
+        n_queriesries += len(places)
+    assert n_queriesries >= 150_000
 
 
-def test_nearest_places_and_gradients_are_those_of_a_ball_and_nothing_is_said_of_nan():
+def test_closest_points_and_gradients_of_a_ball_are_exact_and_nan_stays_nan():
     ball = SurfaceIndex(model_of(trimesh.creation.icosphere(5, 0.05)))
     positions = np.random.default_rng(0).normal(0, 0.05, (2, 50, 3))
-    found = ball.nearest(positions, None)
+    nearest = ball.nearest(positions, None)
     length = np.linalg.norm(positions, axis=-1)
-    np.testing.assert_allclose(found.distance_m, length - 0.05, atol=1e-4)
-    np.testing.assert_allclose(found.normal, positions / length[..., None], atol=0.05)
-    np.testing.assert_allclose(found.closest_m + found.distance_m[..., None] * found.normal, positions, atol=1e-12)
+    np.testing.assert_allclose(nearest.distance_m, length - 0.05, atol=1e-4)
+    np.testing.assert_allclose(nearest.normal, positions / length[..., None], atol=0.05)
+    np.testing.assert_allclose(
+        nearest.closest_m + nearest.distance_m[..., None] * nearest.normal, positions, atol=1e-12
+    )
     lost = ball.nearest(np.full((1, 1, 3), np.nan), None)
     assert np.isinf(lost.distance_m).all()
     assert np.isnan(lost.closest_m).all()
 
 
-def test_the_nearest_place_beside_a_vertex_is_that_vertex_however_near():
+def test_the_closest_point_next_to_a_vertex_is_that_vertex():
     rod = trimesh.creation.cylinder(0.03, 0.1, sections=40)
     surface = PartSurface(rod.vertices, rod.faces, True, 10**9)
     positions = np.repeat(np.asarray(rod.vertices), 50, axis=0)
     positions[:, 2] += np.sign(positions[:, 2]) * 10 ** np.random.default_rng(0).uniform(-12, -7, len(positions))
-    found = surface.nearest(positions)
-    np.testing.assert_allclose(found.closest_m, np.repeat(np.asarray(rod.vertices), 50, axis=0), atol=1e-9)
+    nearest = surface.nearest(positions)
+    np.testing.assert_allclose(nearest.closest_m, np.repeat(np.asarray(rod.vertices), 50, axis=0), atol=1e-9)
 
 
 # Seeds of which 74, 153 and 1 of 4,000 places were far from the place that was said to be theirs.
 @pytest.mark.parametrize(("seed", "shaken"), [(21, False), (30, False), (183, True)])
-def test_the_nearest_place_on_triangles_as_narrow_as_rounding_is_as_far_as_is_said(seed: int, shaken: bool) -> None:
+def test_the_closest_point_on_sliver_triangles_has_the_reported_distance(seed: int, shaken: bool) -> None:
     drawn = np.random.default_rng(seed)
     vertices = np.outer(drawn.normal(size=40), drawn.normal(size=3))  # on a line, but for rounding
     if shaken:
@@ -282,22 +287,22 @@ def test_the_nearest_place_on_triangles_as_narrow_as_rounding_is_as_far_as_is_sa
     normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-300
     near = drawn.integers(0, 60, 4000)
     positions = corners[near, 0] + normals[near] * size * 10 ** drawn.uniform(-6, 0, (4000, 1))
-    found = PartSurface(vertices, faces, False, 10**9).nearest(positions)
-    apart = np.linalg.norm(positions - found.closest_m, axis=1)
-    np.testing.assert_allclose(apart, found.distance_m, atol=1e-6 * size)
+    nearest = PartSurface(vertices, faces, False, 10**9).nearest(positions)
+    apart = np.linalg.norm(positions - nearest.closest_m, axis=1)
+    np.testing.assert_allclose(apart, nearest.distance_m, atol=1e-6 * size)
 
 
 def test_the_signed_distance_inside_a_cube_is_that_to_its_nearest_face():
     cube = SurfaceIndex(box_model((0.2, 0.2, 0.2)))
     points = np.array([[[0.0, 0.0, 0.09], [0.0, 0.0, 0.12]], [[0.0, 0.0, 0.11], [0.0, 0.0, 0.3]]])
-    found = cube.nearest(points, None)
-    np.testing.assert_allclose(found.distance_m[0], [-0.01, 0.02], atol=1e-12)
+    nearest = cube.nearest(points, None)
+    np.testing.assert_allclose(nearest.distance_m[0], [-0.01, 0.02], atol=1e-12)
     np.testing.assert_allclose(cube.depth_m(points, None).max(axis=1), [0.01, 0.0], atol=1e-12)
-    np.testing.assert_allclose(found.closest_m[0, 0], [0, 0, 0.1], atol=1e-12)
-    np.testing.assert_allclose(found.normal[0, 0], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(nearest.closest_m[0, 0], [0, 0, 0.1], atol=1e-12)
+    np.testing.assert_allclose(nearest.normal[0, 0], [0, 0, 1], atol=1e-12)
 
 
-def test_the_nearest_place_of_a_moved_lid_is_where_the_lid_is():
+def test_the_closest_point_on_a_moved_lid_is_on_the_lid():
     base, lid = (
         box_model((0.1, 0.1, 0.04), middle_m=(0.05, 0, -0.021)),
         box_model((0.1, 0.1, 0.02), middle_m=(0.05, 0, 0.011)),
@@ -305,7 +310,7 @@ def test_the_nearest_place_of_a_moved_lid_is_where_the_lid_is():
     model = two_parts(base, lid, (0, -1, 0))
     angles = np.array([0.4, 1.1])
     top = articulate(np.array([[0.05, 0.0, 0.021 + 0.005]]), np.ones(1), model.hinge, angles)
-    found = SurfaceIndex(model).nearest(top, angles)
-    np.testing.assert_allclose(found.distance_m[:, 0], 0.005, atol=1e-9)
+    nearest = SurfaceIndex(model).nearest(top, angles)
+    np.testing.assert_allclose(nearest.distance_m[:, 0], 0.005, atol=1e-9)
     surface = articulate(np.array([[0.05, 0.0, 0.021]]), np.ones(1), model.hinge, angles)
-    np.testing.assert_allclose(found.closest_m, surface, atol=1e-9)
+    np.testing.assert_allclose(nearest.closest_m, surface, atol=1e-9)

@@ -16,8 +16,8 @@ def _halved(centre_m: np.ndarray, triangles: np.ndarray) -> list[int]:
     """Order of the triangles by the rule itself: sort across the longest side, halve, go on with both halves."""
     if len(triangles) <= LEAF:
         return triangles.tolist()
-    own = centre_m[triangles]
-    axis = int(np.argmax(own.max(axis=0) - own.min(axis=0)))
+    centres = centre_m[triangles]
+    axis = int(np.argmax(centres.max(axis=0) - centres.min(axis=0)))
     ordered = np.array(sorted(triangles.tolist(), key=lambda number: centre_m[number, axis]))  # sorted() is stable
     middle = LEAF * int(np.ceil(len(triangles) / (2 * LEAF)))
     return _halved(centre_m, ordered[:middle]) + _halved(centre_m, ordered[middle:])
@@ -39,18 +39,18 @@ def test_triangles_are_halved_across_the_longest_side(count: int, alike: bool) -
 
 
 @pytest.mark.parametrize("count", [1, 9, 1000])
-def test_boxes_hold_their_triangles_and_every_triangle_is_in_one_leaf(count: int) -> None:
+def test_boxes_contain_their_triangles_and_each_triangle_is_in_one_leaf(count: int) -> None:
     vertices, faces = _mesh(count)
     tree = triangle_tree(vertices, faces)
     assert _nodes(tree) == list(range(len(tree.link))) == list(range(len(tree.box)))
     corners = vertices[faces[tree.face]]
-    held: list[int] = []
+    members: list[int] = []
     for (second, start, stop), box in zip(tree.link, tree.box, strict=True):
-        own = corners[start:stop].reshape(-1, 3)
-        np.testing.assert_array_equal(box, np.concatenate([own.min(axis=0), own.max(axis=0)]))
-        held += [] if second else range(start, stop)
+        points = corners[start:stop].reshape(-1, 3)
+        np.testing.assert_array_equal(box, np.concatenate([points.min(axis=0), points.max(axis=0)]))
+        members += [] if second else range(start, stop)
         assert second or stop - start <= LEAF
-    assert sorted(held) == list(range(count))
+    assert sorted(members) == list(range(count))
 
 
 def _plate(axis: int) -> tuple[np.ndarray, np.ndarray]:
@@ -59,14 +59,14 @@ def _plate(axis: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("mesh", [*map(_mesh, (1, 9, 1000)), *map(_plate, range(3))])
-def test_turned_boxes_lie_along_the_mean_normal_and_fit_their_triangles(mesh: tuple[np.ndarray, np.ndarray]) -> None:
+def test_oriented_boxes_are_along_the_mean_normal_and_tight(mesh: tuple[np.ndarray, np.ndarray]) -> None:
     vertices, faces = mesh
     tree = triangle_tree(vertices, faces)
     corners = vertices[faces[tree.face]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     units = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    for (_, start, stop), turned in zip(tree.link, tree.turned_box, strict=True):
-        first, second, low, high = turned.reshape(4, 3)
+    for (_, start, stop), oriented in zip(tree.link, tree.oriented_box, strict=True):
+        first, second, low, high = oriented.reshape(4, 3)
         frame = np.stack([first, second, np.cross(first, second)])
         np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
         mean = units[start:stop].sum(axis=0)

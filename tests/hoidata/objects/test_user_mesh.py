@@ -1,4 +1,4 @@
-"""A person's own mesh: its unit, which way is up and its hinge are told, or found and said."""
+"""A user's mesh: unit, up axis and hinge are given, or guessed and reported."""
 
 import numpy as np
 import pytest
@@ -11,75 +11,75 @@ MUG = trimesh.creation.cylinder(radius=0.04, height=0.1, sections=48)
 Y_UP = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
 
 
-def saved(mesh, path, scale=1.0, turn=None):
+def saved(mesh, path, scale=1.0, transform=None):
     mesh = mesh.copy()
     mesh.apply_scale(scale)
-    if turn is not None:
-        mesh.apply_transform(turn)
+    if transform is not None:
+        mesh.apply_transform(transform)
     mesh.export(path)
     return path
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".stl"])
-def test_a_mesh_that_stands_on_z_is_taken_as_it_is(tmp_path, suffix):
-    found = read_user_object(saved(MUG, tmp_path / f"mug{suffix}"))
-    assert np.ptp(found.model.vertices_m, axis=0) == pytest.approx([0.08, 0.08, 0.1], abs=1e-6)
-    assert found.notes[0].startswith("up: z (it stands on ")
+def test_a_mesh_that_stands_on_z_is_unchanged(tmp_path, suffix):
+    user_object = read_user_object(saved(MUG, tmp_path / f"mug{suffix}"))
+    assert np.ptp(user_object.model.vertices_m, axis=0) == pytest.approx([0.08, 0.08, 0.1], abs=1e-6)
+    assert user_object.notes[0].startswith("up: z (it stands on ")
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".glb"])
-def test_a_mesh_that_stands_on_y_is_stood_upright(tmp_path, suffix):
-    found = read_user_object(saved(MUG, tmp_path / f"mug{suffix}", turn=Y_UP))
-    assert np.ptp(found.model.vertices_m, axis=0) == pytest.approx([0.08, 0.08, 0.1], abs=1e-6)
-    assert found.notes[0].startswith("up: y (it stands on " if suffix == ".obj" else "y is up")
+def test_a_mesh_that_stands_on_y_is_rotated_upright(tmp_path, suffix):
+    user_object = read_user_object(saved(MUG, tmp_path / f"mug{suffix}", transform=Y_UP))
+    assert np.ptp(user_object.model.vertices_m, axis=0) == pytest.approx([0.08, 0.08, 0.1], abs=1e-6)
+    assert user_object.notes[0].startswith("up: y (it stands on " if suffix == ".obj" else "y is up")
 
 
-def test_a_glass_with_a_narrow_foot_is_stood_upright(tmp_path):
+def test_a_glass_with_a_narrow_foot_is_rotated_upright(tmp_path):
     glass = trimesh.creation.revolve([[0, 0], [0.012, 0], [0.002, 0.01], [0.002, 0.08], [0.04, 0.12], [0, 0.12]])
-    found = read_user_object(saved(glass, tmp_path / "glass.obj", turn=Y_UP))
-    assert np.ptp(found.model.vertices_m, axis=0) == pytest.approx([0.08, 0.08, 0.12], abs=2e-3)
-    assert found.notes[0].startswith("up: y (it stands on 9% of its outline; with z up on ")
+    user_object = read_user_object(saved(glass, tmp_path / "glass.obj", transform=Y_UP))
+    assert np.ptp(user_object.model.vertices_m, axis=0) == pytest.approx([0.08, 0.08, 0.12], abs=2e-3)
+    assert user_object.notes[0].startswith("up: y (it stands on 9% of its outline; with z up on ")
 
 
-def test_a_bowl_that_stands_on_little_is_not_laid_on_its_side(tmp_path):
+def test_a_bowl_with_a_small_foot_is_not_rotated(tmp_path):
     ball = trimesh.creation.icosphere(4, 0.05)
     ball.update_faces(ball.triangles_center[:, 2] < 0)
     ball.remove_unreferenced_vertices()
-    found = read_user_object(saved(ball, tmp_path / "bowl.obj"))
-    assert np.ptp(found.model.vertices_m, axis=0) == pytest.approx([0.1, 0.1, 0.05], abs=2e-3)
-    assert found.notes[0].startswith("up: z")
+    user_object = read_user_object(saved(ball, tmp_path / "bowl.obj"))
+    assert np.ptp(user_object.model.vertices_m, axis=0) == pytest.approx([0.1, 0.1, 0.05], abs=2e-3)
+    assert user_object.notes[0].startswith("up: z")
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
-def test_the_axis_told_points_up_and_nothing_is_mirrored(tmp_path, up):
+def test_the_given_axis_points_up_and_nothing_is_mirrored(tmp_path, up):
     corner = trimesh.Trimesh(
         [[0, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
     )
     path = saved(corner, tmp_path / "corner.ply")
-    found = read_user_object(path, up=up).model.vertices_m
-    told = corner.vertices @ (np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1))
-    assert found[:, 2] == pytest.approx(told, abs=1e-6)
-    assert trimesh.Trimesh(found, corner.faces).volume == pytest.approx(corner.volume, rel=1e-4)
+    vertices_m = read_user_object(path, up=up).model.vertices_m
+    expected_height_m = corner.vertices @ (np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1))
+    assert vertices_m[:, 2] == pytest.approx(expected_height_m, abs=1e-6)
+    assert trimesh.Trimesh(vertices_m, corner.faces).volume == pytest.approx(corner.volume, rel=1e-4)
 
 
 @pytest.mark.parametrize(("scale", "says"), [(1000, "--unit mm makes it 10 cm"), (150, "--unit cm makes it 15 cm")])
-def test_a_size_that_cannot_be_meant_names_the_likely_unit(tmp_path, scale, says):
+def test_the_error_of_an_implausible_size_suggests_a_unit(tmp_path, scale, says):
     path = saved(MUG, tmp_path / "mug.stl", scale)
     with pytest.raises(BadInput, match=says):
         read_user_object(path)
 
 
-def test_a_unit_that_is_told_is_used(tmp_path):
-    found = read_user_object(saved(MUG, tmp_path / "mug.stl", 1000), unit="mm")
-    assert np.ptp(found.model.vertices_m, axis=0) == pytest.approx([0.08, 0.08, 0.1], abs=1e-6)
+def test_a_given_unit_is_used(tmp_path):
+    user_object = read_user_object(saved(MUG, tmp_path / "mug.stl", 1000), unit="mm")
+    assert np.ptp(user_object.model.vertices_m, axis=0) == pytest.approx([0.08, 0.08, 0.1], abs=1e-6)
     with pytest.raises(BadInput, match="m, cm, mm, dm, inch"):
         read_user_object(tmp_path / "mug.stl", unit="feet")
 
 
-def test_the_second_of_two_pieces_turns_about_the_hinge(tmp_path):
+def test_the_second_of_two_pieces_rotates_about_the_hinge(tmp_path):
     base, lid = trimesh.creation.box((200, 150, 40)), trimesh.creation.box((200, 150, 20))
     lid.apply_translation([0, 0, 31])
-    path = saved(trimesh.util.concatenate([base, lid]), tmp_path / "box.obj", turn=Y_UP)
+    path = saved(trimesh.util.concatenate([base, lid]), tmp_path / "box.obj", transform=Y_UP)
     model = read_user_object(path, unit="mm", up="y", hinge="0,25,-75 2,0,0").model
     assert model.hinge is not None
     assert model.hinge.origin_m == pytest.approx([0, 0.075, 0.025], abs=1e-9)
@@ -100,18 +100,18 @@ def test_a_lid_may_lie_on_its_box(tmp_path, name):
     assert model.vertices_m[model.part == 0, 2].max() == pytest.approx(0.02, abs=1e-6)
 
 
-@pytest.mark.parametrize(("direction", "told"), [("-1,0,0", False), ("1,0,0", True), ("0,0,1", False)])
-def test_a_hinge_that_turns_the_lid_into_its_box_is_told(tmp_path, direction, told):
+@pytest.mark.parametrize(("direction", "is_reported"), [("-1,0,0", False), ("1,0,0", True), ("0,0,1", False)])
+def test_a_hinge_that_rotates_the_lid_into_its_box_is_reported(tmp_path, direction, is_reported):
     """Turned the other way, or aside like the lid of a tin, nothing is said."""
     base, lid = trimesh.creation.box((0.2, 0.15, 0.04)), trimesh.creation.box((0.2, 0.15, 0.02))
     lid.apply_translation([0, 0, 0.031])
     path = saved(trimesh.util.concatenate([base, lid]), tmp_path / "box.obj")
     notes = read_user_object(path, up="z", hinge=f"0,0.075,0.02 {direction}").notes
-    assert any("turn its direction round" in note for note in notes) == told
+    assert any("turn its direction round" in note for note in notes) == is_reported
 
 
 @pytest.mark.parametrize("hinge", ["0,0,0", "0,0,0 0,0,0", "a,b,c 1,0,0", "0,0,0 1,0,nan"])
-def test_a_hinge_that_is_none_is_refused_with_an_example(tmp_path, hinge):
+def test_an_invalid_hinge_is_refused_with_an_example(tmp_path, hinge):
     with pytest.raises(BadInput, match="--hinge"):
         read_user_object(saved(MUG, tmp_path / "mug.obj"), hinge=hinge)
 
@@ -150,7 +150,7 @@ def stl_text(names=("body", "lid")):
 def parts_of(path):
     """Least and greatest height of both parts, in the file's axes."""
     model = read_user_object(path, up="z", hinge="0,-0.1,0.04 1,0,0").model
-    return [(own[:, 2].min().round(6), own[:, 2].max().round(6)) for own in
+    return [(vertices[:, 2].min().round(6), vertices[:, 2].max().round(6)) for vertices in
             (model.vertices_m[model.faces_of(part)].reshape(-1, 3) for part in (0, 1))]  # fmt: skip
 
 
@@ -168,7 +168,7 @@ NAMED = {
 
 
 @pytest.mark.parametrize("name", NAMED)
-def test_what_a_file_names_are_the_two_parts_however_many_shells_each_has(tmp_path, name):
+def test_named_pieces_are_the_two_parts_with_any_number_of_shells(tmp_path, name):
     (tmp_path / name).write_text(NAMED[name]())
     assert parts_of(tmp_path / name) == TWO_PARTS
 
@@ -189,7 +189,7 @@ def test_a_lid_of_several_nodes_under_one_node_is_a_part(tmp_path):
 
 
 def test_pieces_that_share_vertices_are_cut_apart_where_their_names_change(tmp_path):
-    """A cover that is one surface with its back: each part gets its own vertices along the fold."""
+    """A cover that is one surface with its back: each part gets separate vertices along the fold."""
     corners = "v 0 0 0\nv 0.1 0 0\nv 0.1 0.1 0\nv 0 0.1 0\nv 0.1 0.2 0.01\nv 0 0.2 0.01\n"
     (tmp_path / "cover.obj").write_text(corners + "g back\nf 1 2 3 4\ng front\nf 4 3 5 6\n")
     model = read_user_object(tmp_path / "cover.obj", up="z", hinge="0,0.1,0 1,0,0").model
@@ -197,7 +197,7 @@ def test_pieces_that_share_vertices_are_cut_apart_where_their_names_change(tmp_p
     assert [model.vertices_m[model.faces_of(part)][..., 1].max().round(6) for part in (0, 1)] == [0.1, 0.2]
 
 
-def test_the_names_of_what_moves_and_what_stays_are_told(tmp_path):
+def test_the_names_of_moving_and_fixed_piece_are_reported(tmp_path):
     (tmp_path / "box.obj").write_text(obj_text())
     notes = read_user_object(tmp_path / "box.obj", up="z", hinge="0,-0.1,0.04 1,0,0").notes
     assert "'lid' turns about the hinge, 'body' stays" in notes
@@ -250,12 +250,12 @@ def test_other_mesh_formats_are_refused_with_those_that_are_read(tmp_path):
 
 
 def test_the_vertices_of_a_glb_stay_joined_along_its_seams_wherever_its_nodes_put_it(tmp_path):
-    """Stored with a normal of its own for each face, so that every corner is repeated; a turn must not part them."""
+    """Stored with one normal per face, so that all corners are repeated; a rotation must not separate them."""
     box = trimesh.creation.icosphere(4, 0.05)
     box.unmerge_vertices()
-    turn = trimesh.transformations.rotation_matrix(0.7, [3, -1, 2], [0.1, 0.2, 0.3])
+    transform = trimesh.transformations.rotation_matrix(0.7, [3, -1, 2], [0.1, 0.2, 0.3])
     scene = trimesh.Scene()
-    scene.add_geometry(box, transform=turn)
+    scene.add_geometry(box, transform=transform)
     scene.export(tmp_path / "ball.glb")
     assert len(read_mesh_file(tmp_path / "ball.glb").vertices) == len(trimesh.creation.icosphere(4, 0.05).vertices)
 

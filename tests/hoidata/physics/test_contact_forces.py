@@ -61,9 +61,9 @@ def test_a_box_held_by_one_wall_alone_is_not_explained():
 def test_free_fall_with_spin_needs_no_contact():
     times = np.arange(6)[:, None] / 120
     centre = np.array([0.0, 0.0, 1.0]) + times * [0.3, 0.0, 1.0] - 0.5 * GRAVITY_M_S2 * times**2 * [0, 0, 1]
-    turn = Rotation.from_rotvec(times * [0.0, 0.0, 4.0]).as_matrix()
-    inertia = turn @ mass_properties(*sharp_box(SIZE)).inertia_kg_m2 @ turn.transpose(0, 2, 1)
-    wrench = required_wrench(BodyMotion(centre, inertia, turn), 120, DOWN)
+    rotmats = Rotation.from_rotvec(times * [0.0, 0.0, 4.0]).as_matrix()
+    inertia = rotmats @ mass_properties(*sharp_box(SIZE)).inertia_kg_m2 @ rotmats.transpose(0, 2, 1)
+    wrench = required_wrench(BodyMotion(centre, inertia, rotmats), 120, DOWN)
     assert force_residual(np.zeros((0, 3)), np.zeros((0, 3)), centre[3], wrench[3]) < RESIDUAL_LIMIT
 
 
@@ -87,7 +87,7 @@ def test_cone_edges_push_inwards_and_slide_by_the_friction_coefficient():
     np.testing.assert_allclose(np.linalg.norm(edges + normals[:, None], axis=2), 0.35)
 
 
-def test_a_push_from_above_beside_the_centre_turns_the_body_that_way():
+def test_an_off_centre_push_from_above_rotates_the_body_to_that_side():
     """A finger at x = 1 presses down: its four edges add up to four pushes, and their torque turns about +y."""
     columns = wrench_columns(np.array([[1.0, 0, 0]]), np.array([[0.0, 0, 1]]), np.zeros(3))
     np.testing.assert_allclose(columns.sum(axis=1), [0, 0, -4, 0, 4, 0], atol=1e-12)
@@ -141,6 +141,6 @@ def test_every_patch_of_a_hand_has_vertices_and_left_mirrors_right():
 
 def test_one_contact_per_patch_at_its_deepest_vertex():
     points = np.array([[[0.0, 0.0, 0.1005], [0.01, 0.0, 0.098], [0.05, 0.0, 0.11], [-0.05, 0.0, 0.101]]])
-    found = SurfaceIndex(box_model((0.2, 0.2, 0.2))).nearest(points, None)
-    contacts = patch_contacts(found, np.array([0, 0, 1, 2]), 0)
+    nearest = SurfaceIndex(box_model((0.2, 0.2, 0.2))).nearest(points, None)
+    contacts = patch_contacts(nearest, np.array([0, 0, 1, 2]), 0)
     np.testing.assert_allclose(contacts.points_m, [[0.01, 0, 0.1], [-0.05, 0, 0.1]], atol=1e-12)

@@ -34,7 +34,7 @@ def test_residuals_and_decisions_are_scipys_on_a_thousand_random_systems():
 @given(
     st.integers(1, 12).flatmap(lambda n: arrays(float, (6, n), elements=NUMBERS)), arrays(float, 6, elements=NUMBERS)
 )
-def test_what_is_left_points_along_no_column_and_is_never_longer_than_the_wrench(columns, wrench):
+def test_the_residual_has_no_component_along_a_column_and_is_at_most_the_wrench(columns, wrench):
     # The Karush-Kuhn-Tucker conditions: columns may repeat, vanish or depend on each other.
     left = _one(columns, wrench)
     scale = np.linalg.norm(columns, axis=0) * np.linalg.norm(wrench)
@@ -60,7 +60,7 @@ def test_a_push_that_would_have_to_pull_is_left_out():
 def test_too_few_steps_give_an_upper_bound():
     rng = np.random.default_rng(1)
     columns, wrench = rng.normal(size=(6, 40)), rng.normal(size=6)
-    lengths = [np.linalg.norm(_one(columns, wrench, most_steps=steps)) for steps in (1, 2, 4, 8, 300)]
+    lengths = [np.linalg.norm(_one(columns, wrench, max_steps=steps)) for steps in (1, 2, 4, 8, 300)]
     assert lengths == sorted(lengths, reverse=True)
     assert lengths[0] == pytest.approx(np.linalg.norm(wrench))
     assert lengths[-1] < 1e-9

@@ -32,10 +32,10 @@ NONE = np.zeros((20, 0, 3))
 BOX = box_model(tuple(SIZE))
 
 
-def _scene(centre_m: np.ndarray, rotmats: np.ndarray | None = None, hands: Capsules | None = None, **given) -> Scene:
+def _scene(centre_m: np.ndarray, rotmats: np.ndarray | None = None, hands: Capsules | None = None, **options) -> Scene:
     turned = np.tile(np.eye(3), (len(centre_m), 1, 1)) if rotmats is None else rotmats
     hands = Capsules(NONE, NONE, np.zeros(0)) if hands is None else hands
-    return Scene(BOX, ObjectPoses(turned, centre_m), hands, FPS, DOWN, **{"table_m": 0.0, **given})
+    return Scene(BOX, ObjectPoses(turned, centre_m), hands, fps=FPS, gravity=DOWN, **{"table_m": 0.0, **options})
 
 
 def _times() -> np.ndarray:
@@ -48,8 +48,8 @@ def _pinch(centre_m: np.ndarray, rotmats: np.ndarray | None = None, sides=(-1, 1
     radius = 0.01
     middle = np.array([[side * (SIZE[0] / 2 + radius - 0.001), 0, z] for side in sides for z in (-0.01, 0.01)])
     half = np.array([0, 0.005, 0])
-    place = [(middle + end) @ turned.transpose(0, 2, 1) + centre_m[:, None] for end in (-half, half)]
-    return Capsules(*place, np.full(len(middle), radius))
+    ends = [(middle + end) @ turned.transpose(0, 2, 1) + centre_m[:, None] for end in (-half, half)]
+    return Capsules(*ends, np.full(len(middle), radius))
 
 
 def _thrown() -> tuple[np.ndarray, np.ndarray]:
@@ -87,7 +87,7 @@ def test_an_object_held_in_the_air_without_any_contact_is_never_explained():
         assert result.residual.min() > 5  # of 9.81 N
 
 
-def test_a_box_on_a_table_is_explained_by_the_table_and_by_nothing_less():
+def test_only_a_table_at_the_right_height_explains_a_resting_box():
     scene = _scene(_resting())
     assert not scene.lifted.any()
     assert score(scene, StandardUnits(), EVERY).share == 0.0
@@ -95,11 +95,11 @@ def test_a_box_on_a_table_is_explained_by_the_table_and_by_nothing_less():
     assert score(scene, StandardUnits(table_m=-0.01), EVERY).share == 0.0
 
 
-def test_a_table_carries_no_box_whose_centre_lies_beyond_its_edge():
-    # Turned by 30 degrees about y the box stands on one edge, its centre beside it: it must fall.
-    turn = Rotation.from_rotvec([0, np.pi / 6, 0]).as_matrix()
-    lowest = (BOX.vertices_m @ turn.T)[:, 2].min()
-    scene = _scene(np.tile([0.0, 0.0, -lowest], (20, 1)), np.tile(turn, (20, 1, 1)))
+def test_a_table_does_not_support_a_box_whose_centre_is_beyond_its_edge():
+    # Rotated by 30 degrees about y, the box stands on one edge with its centre off that edge, so it must fall.
+    rotation = Rotation.from_rotvec([0, np.pi / 6, 0]).as_matrix()
+    lowest = (BOX.vertices_m @ rotation.T)[:, 2].min()
+    scene = _scene(np.tile([0.0, 0.0, -lowest], (20, 1)), np.tile(rotation, (20, 1, 1)))
     assert score(scene, StandardUnits(table_m=0.0), EVERY).share == 0.0
 
 
@@ -120,22 +120,22 @@ def test_a_pinch_carries_the_box_along_any_gentle_motion_and_one_side_alone_does
     assert score(_scene(centre, turned, away), StandardUnits()).share == 0.0
 
 
-def test_the_answer_does_not_depend_on_the_world_frame():
+def test_residuals_do_not_depend_on_the_world_frame():
     centre = np.array([0.0, 0.0, 0.5]) + 0.3 * np.random.default_rng(0).normal(size=(20, 3)).cumsum(axis=0) / FPS**2
     hands = _pinch(centre, sides=(1,))
-    turn, shift = Rotation.from_rotvec([0.5, 1.0, -0.3]).as_matrix(), np.array([1.0, -2.0, 0.3])
+    rotation, shift = Rotation.from_rotvec([0.5, 1.0, -0.3]).as_matrix(), np.array([1.0, -2.0, 0.3])
     scene = _scene(centre, hands=hands)
     moved = Scene(
         BOX,
-        ObjectPoses(np.tile(turn, (20, 1, 1)), centre @ turn.T + shift),
-        Capsules(hands.start_m @ turn.T + shift, hands.end_m @ turn.T + shift, hands.radius_m),
-        FPS,
-        turn @ DOWN,
-        table_m=float(-(turn @ DOWN) @ shift),
+        ObjectPoses(np.tile(rotation, (20, 1, 1)), centre @ rotation.T + shift),
+        Capsules(hands.start_m @ rotation.T + shift, hands.end_m @ rotation.T + shift, hands.radius_m),
+        fps=FPS,
+        gravity=rotation @ DOWN,
+        table_m=float(-(rotation @ DOWN) @ shift),
     )
-    for thing in (scene, moved):
-        assert thing.held.all()
-    first, second = (score(thing, StandardUnits()) for thing in (scene, moved))
+    for variant_scene in (scene, moved):
+        assert variant_scene.held.all()
+    first, second = (score(variant_scene, StandardUnits()) for variant_scene in (scene, moved))
     assert first.residual.max() > 1
     # The four edges of a cone turn about its normal with the world, so only a little of a residual may change.
     np.testing.assert_allclose(first.residual, second.residual, rtol=0.1)
@@ -165,12 +165,12 @@ def test_residuals_of_both_variants_are_those_of_a_system_set_up_by_hand():
     scene = _scene(path, turned, _pinch(path, turned, sides=(1,)))
     contacts = capsule_contacts(scene.model, scene.poses, scene.capsules)
     frame, released = 7, AsReleased()
-    own = contacts.frame == frame
-    assert own.sum() == 2
-    arms = contacts.point_m[own] - path[frame]
+    in_frame = contacts.frame == frame
+    assert in_frame.sum() == 2
+    arms = contacts.point_m[in_frame] - path[frame]
     ours = StandardUnits().residuals(scene, contacts)[frame]
-    assert ours == pytest.approx(_by_scipy(scene.wrench[frame], cone_edges(contacts.normal[own]), arms), rel=1e-9)
-    edges = friction_edges(contacts.normal[own], 0.35)
+    assert ours == pytest.approx(_by_scipy(scene.wrench[frame], cone_edges(contacts.normal[in_frame]), arms), rel=1e-9)
+    edges = friction_edges(contacts.normal[in_frame], 0.35)
     wrench = released.wrench(scene, path)[frame]
     expected = _by_scipy(wrench, edges, arms * 10) ** 2 / 6
     assert expected < 0.9 * wrench @ wrench / 6  # the contacts do something
@@ -189,7 +189,7 @@ def test_the_released_torque_is_per_frame_in_square_decimetres_with_its_gyroscop
     # Steady about an oblique axis: only w x I w is left.
     spin = np.array([2.0, 1.0, -3.0])
     turned = Rotation.from_rotvec(time * spin).as_matrix()
-    expected = [step * np.cross(spin, turn @ inertia @ turn.T @ spin) for turn in turned]
+    expected = [step * np.cross(spin, rotation @ inertia @ rotation.T @ spin) for rotation in turned]
     np.testing.assert_allclose(AsReleased().wrench(_scene(path, turned), path)[:, 3:], expected, atol=1e-9)
 
 
@@ -220,7 +220,7 @@ def test_as_released_about_the_origin_differs_only_where_the_mesh_is_not_centred
     shifted = ObjectModel("box", BOX.vertices_m + np.array([0, 0, 0.05]), BOX.faces, np.zeros(8, dtype=np.uint8))
     poses = ObjectPoses(turned, path - turned @ [0, 0, 0.05])
     empty = Capsules(NONE, NONE, np.zeros(0))
-    scene = Scene(shifted, poses, empty, FPS, DOWN, 0.0)
+    scene = Scene(shifted, poses, empty, fps=FPS, gravity=DOWN, table_m=0.0)
     first, second = (score(scene, one).residual for one in about.values())
     np.testing.assert_allclose(second, score(_scene(path, turned), AsReleased()).residual, atol=1e-9)
     assert np.abs(first - second).max() > 5e-4
@@ -247,7 +247,7 @@ def test_a_lid_that_opens_counts_for_the_lowest_vertex():
     lid = box_model(tuple(SIZE), middle_m=(0, SIZE[1], 0))
     model = two_parts(BOX, lid, (1, 0, 0), (0, SIZE[1] / 2, -SIZE[2] / 2))
     poses = ObjectPoses(np.tile(np.eye(3), (3, 1, 1)), np.tile([0, 0, 0.5], (3, 1)), np.array([0.0, -0.5, -1.0]))
-    scene = Scene(model, poses, Capsules(*np.zeros((2, 3, 0, 3)), np.zeros(0)), FPS, DOWN)
+    scene = Scene(model, poses, Capsules(*np.zeros((2, 3, 0, 3)), np.zeros(0)), fps=FPS, gravity=DOWN)
     expected = 0.5 - SIZE[2] / 2 - SIZE[1] * np.sin([0, 0.5, 1.0])
     np.testing.assert_allclose(scene.lowest_m, expected, atol=1e-9)
 
@@ -258,7 +258,7 @@ def test_the_lowest_vertex_is_the_lowest_of_all_in_the_world():
     rotmats = Rotation.random(40, random_state=0).as_matrix()
     poses = ObjectPoses(rotmats, random.normal(size=(40, 3)), random.uniform(-2, 2, 40))
     gravity = np.array([0.36, 0.48, -0.8])
-    scene = Scene(model, poses, Capsules(*np.zeros((2, 40, 0, 3)), np.zeros(0)), FPS, gravity)
+    scene = Scene(model, poses, Capsules(*np.zeros((2, 40, 0, 3)), np.zeros(0)), fps=FPS, gravity=gravity)
     expected = (scene.vertices_m(slice(None)) @ -gravity).min(axis=1)
     np.testing.assert_allclose(scene.lowest_m, expected, atol=1e-12)
 
@@ -276,7 +276,7 @@ def test_a_clip_becomes_a_scene_with_both_hands_and_an_invalid_hand_is_absent(ma
     assert score(absent, StandardUnits(tolerance_m=0.005)).frames.tolist() == [*range(6)]
 
 
-def test_a_clip_that_does_not_know_where_down_is_is_refused(make_clip):
+def test_a_clip_without_gravity_is_refused(make_clip):
     with pytest.raises(BadInput, match="gravity"):
         clip_scene(make_clip(n_frames=6, gravity=None), load_embedded_hands())
 

@@ -198,7 +198,7 @@ def test_future_readings_move_the_present_hand_with_the_wrist_alone():
 def test_single_frames_without_a_grid_give_the_bits_of_a_batch():
     hand, model = small_hand(), MESHES["torus"]
     state, wrist = scene(hand)
-    whole = sense(hand, state, wrist, None, SurfaceIndex(model, grid_from=0)).flat()
+    whole = sense(hand, state, wrist, None, SurfaceIndex(model, grid_after=0)).flat()
     surface = SurfaceIndex(model)
     frames = [sense(hand, state.taken(slice(f, f + 1)), wrist[f : f + 1], None, surface).flat() for f in range(40)]
     np.testing.assert_array_equal(np.concatenate(frames), whole)

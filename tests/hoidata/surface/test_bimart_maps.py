@@ -33,11 +33,11 @@ def placed(track: ObjectTrack, vertices: np.ndarray, valid: np.ndarray | None = 
     frames = np.arange(len(vertices)) if valid is None else np.flatnonzero(valid)
     hinge = None if track.hinge_rad is None else track.hinge_rad[frames]
     return PlacedHand(
-        (track.world_from_object.inverse() @ vertices.astype(np.float64))[frames],
-        frames,
-        hinge,
-        np.zeros((0, 3), int),
-        len(vertices),
+        vertices_m=(track.world_from_object.inverse() @ vertices.astype(np.float64))[frames],
+        frames=frames,
+        hinge_rad=hinge,
+        faces=np.zeros((0, 3), int),
+        n_frames=len(vertices),
     )
 
 
@@ -52,8 +52,8 @@ def world_points(track: ObjectTrack, points) -> np.ndarray:
         local = points.points_m.astype(np.float64).copy()
         if track.model.hinge is not None:
             moves, hinge = points.part == 1, track.model.hinge
-            turn = Rotation.from_rotvec(np.asarray(hinge.axis) * track.hinge_rad[frame])
-            local[moves] = turn.apply(local[moves] - hinge.origin_m) + hinge.origin_m
+            rotation = Rotation.from_rotvec(np.asarray(hinge.axis) * track.hinge_rad[frame])
+            local[moves] = rotation.apply(local[moves] - hinge.origin_m) + hinge.origin_m
         pose = Rotation.from_rotvec(np.asarray(track.rotvec[frame], np.float64))
         placed.append(pose.apply(local) + track.translation_m[frame])
     return np.array(placed)
@@ -97,8 +97,8 @@ def test_map_is_unchanged_in_another_world_and_in_a_mirror(scene, changed):
     other, flip = changed(clip), MIRROR if changed is mirror_image else np.ones(3)
     other_points = replace(points, points_m=(points.points_m * flip).astype(np.float32))
     for side in SIDES:
-        seen = other.object.translation_m[:, None] + (in_object(clip, vertices[side]) * flip) @ turns(other)
-        before, after = map_of(clip.object, vertices[side], points), map_of(other.object, seen, other_points)
+        mirrored_m = other.object.translation_m[:, None] + (in_object(clip, vertices[side]) * flip) @ turns(other)
+        before, after = map_of(clip.object, vertices[side], points), map_of(other.object, mirrored_m, other_points)
         np.testing.assert_array_equal(np.isfinite(before), np.isfinite(after))
         np.testing.assert_allclose(before, after, atol=1e-6)
 
@@ -113,16 +113,16 @@ def test_frames_without_the_hand_are_beyond_and_do_not_count(scene):
     assert np.isinf(map_of(clip.object, vertices["right"], points, np.zeros(clip.n_frames, bool))).all()
 
 
-def test_a_hand_too_far_away_gives_nothing_and_one_within_reach_is_seen(make_clip):
+def test_a_hand_beyond_the_reach_gives_infinity(make_clip):
     clip: Clip = make_clip(2)
     points = sample_points(clip.object.model, POINTS)
     centre = clip.object.translation_m[:, None].astype(np.float64)
-    beside = np.array((0.0, 0.0, 1.0))
+    offset = np.array((0.0, 0.0, 1.0))
     radius = np.linalg.norm(points.points_m, axis=1)
     for away, reached in ((0.19, True), (0.45, False)):
-        hand = centre + away * beside
-        found = map_of(clip.object, np.broadcast_to(hand, (2, 778, 3)), points)
-        assert np.isfinite(found).any() == reached
+        hand = centre + away * offset
+        distances = map_of(clip.object, np.broadcast_to(hand, (2, 778, 3)), points)
+        assert np.isfinite(distances).any() == reached
     assert radius.max() < 0.1
 
 

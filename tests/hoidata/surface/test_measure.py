@@ -28,9 +28,9 @@ def box_distance(places: np.ndarray) -> np.ndarray:
 
 def in_box(places: np.ndarray, track: ObjectTrack) -> np.ndarray:
     """World places (frame, place, 3) in the box's frame, with SciPy's rotations."""
-    turn = Rotation.from_rotvec(np.asarray(track.rotvec, np.float64))
+    rotation = Rotation.from_rotvec(np.asarray(track.rotvec, np.float64))
     return np.array(
-        [turn[f].inv().apply(p - np.asarray(track.translation_m[f], np.float64)) for f, p in enumerate(places)]
+        [rotation[f].inv().apply(p - np.asarray(track.translation_m[f], np.float64)) for f, p in enumerate(places)]
     )
 
 
@@ -54,29 +54,29 @@ def measured(clip, side):
 
 
 def test_contact_depth_and_joint_distance_are_those_of_the_box(through):
-    found, hands = measured(through, "right"), load_embedded_hands()
+    measures, hands = measured(through, "right"), load_embedded_hands()
     valid = through.hands["right"].valid
     exact = box_distance(in_box(track_vertices(through.hands["right"], hands["right"]), through.object))
     sure = np.abs(np.abs(exact) - TOUCH_M) > 1e-6
-    assert found.touched.shape == (20, 778)
-    assert 0 < found.touched.sum() < found.touched.size
-    np.testing.assert_array_equal(found.touched[sure], ((np.abs(exact) < TOUCH_M) & valid[:, None])[sure])
-    depth = found.depth_m
+    assert measures.touched.shape == (20, 778)
+    assert 0 < measures.touched.sum() < measures.touched.size
+    np.testing.assert_array_equal(measures.touched[sure], ((np.abs(exact) < TOUCH_M) & valid[:, None])[sure])
+    depth = measures.depth_m
     assert (depth[valid] > 0.01).any()
     assert (depth[valid] == 0).any()
     np.testing.assert_allclose(depth[valid], np.maximum(-exact.min(axis=1), 0)[valid], atol=1e-6)
     assert np.isnan(depth[~valid]).all()
     joints = np.abs(box_distance(in_box(track_joints(through.hands["right"], hands["right"]), through.object)))
-    np.testing.assert_allclose(found.joint_m[valid], joints.min(axis=1)[valid], atol=1e-6)
-    assert np.isinf(found.joint_m[~valid]).all()
+    np.testing.assert_allclose(measures.joint_m[valid], joints.min(axis=1)[valid], atol=1e-6)
+    assert np.isinf(measures.joint_m[~valid]).all()
 
 
-def test_a_hand_that_is_never_there_touches_nothing(through):
-    found = measured(through, "left")
-    assert not found.touched.any()
-    assert np.isnan(found.depth_m).all()
-    assert np.isinf(found.joint_m).all()
-    assert np.isinf(found.map_m).all()
+def test_a_hand_that_is_never_valid_touches_nothing(through):
+    measures = measured(through, "left")
+    assert not measures.touched.any()
+    assert np.isnan(measures.depth_m).all()
+    assert np.isinf(measures.joint_m).all()
+    assert np.isinf(measures.map_m).all()
 
 
 def test_map_is_bimarts(through):
@@ -91,6 +91,6 @@ def test_object_without_an_inside_has_no_depth(make_clip):
     clip = make_clip(6)
     corners = np.array([(-0.05, -0.04, 0.03), (0.05, -0.04, 0.03), (0.05, 0.04, 0.03), (-0.05, 0.04, 0.03)])
     plate = ObjectModel("plate", corners, np.array([(0, 1, 2), (0, 2, 3)]), np.zeros(4, np.uint8))
-    found = measured(with_object(clip, model=plate), "right")
-    assert np.isnan(found.depth_m).all()
-    assert found.touched.any()
+    measures = measured(with_object(clip, model=plate), "right")
+    assert np.isnan(measures.depth_m).all()
+    assert measures.touched.any()

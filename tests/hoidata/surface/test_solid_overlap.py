@@ -59,43 +59,43 @@ def test_volumes_in_two_parts_are_added_up() -> None:
     """A bar of 1 cm2 through both plates of 2 cm."""
     model = tin()
     bar = box_at((0.01, 0.01, 0.2), (0.02, 0, 0))
-    found = SolidOverlap(SurfaceIndex(model)).volume_m3(bar.vertices[None], bar.faces, np.zeros(1))
-    np.testing.assert_allclose(found, 4e-6, atol=1e-12)
+    volume_m3 = SolidOverlap(SurfaceIndex(model)).volume_m3(bar.vertices[None], bar.faces, np.zeros(1))
+    np.testing.assert_allclose(volume_m3, 4e-6, atol=1e-12)
 
 
 def test_two_balls_share_a_lens() -> None:
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.04)
     apart = 0.05
     lens = np.pi / 12 * (4 * 0.04 + apart) * (2 * 0.04 - apart) ** 2
-    moved = np.stack([ball.vertices + apart * way for way in np.eye(3)])
+    moved = np.stack([ball.vertices + apart * direction for direction in np.eye(3)])
     np.testing.assert_allclose(overlap_of(ball).volume_m3(moved, ball.faces, None), lens, rtol=0.015)
 
 
-def test_a_ball_in_the_cavity_of_a_mug_shares_nothing_with_it() -> None:
+def test_a_ball_in_the_cavity_of_a_mug_has_no_overlap() -> None:
     profile = [(0, 0), (0.04, 0), (0.04, 0.1), (0.035, 0.1), (0.035, 0.008), (0, 0.008)]
     mug, ball = trimesh.creation.revolve(np.array(profile)), trimesh.creation.icosphere(radius=0.02)
     overlap = overlap_of(mug)
     places = np.stack([ball.vertices + at for at in ([0, 0, 0.05], [0, 0, 0.02], [0.03, 0, 0.05])])
-    found = overlap.volume_m3(places, ball.faces, None)
-    assert found[0] == 0
-    assert found[1] > 1e-6
-    assert found[2] > 1e-6
+    volumes_m3 = overlap.volume_m3(places, ball.faces, None)
+    assert volumes_m3[0] == 0
+    assert volumes_m3[1] > 1e-6
+    assert volumes_m3[2] > 1e-6
 
 
 def test_a_surface_that_enters_itself_counts_once() -> None:
     """Two boxes of one surface overlap each other inside a larger one."""
     one, two = box_at((0.04, 0.04, 0.04), (0, 0, 0)), box_at((0.04, 0.04, 0.04), (0.02, 0, 0))
     both = trimesh.util.concatenate([one, two])
-    found = overlap_of(box_at((0.2, 0.2, 0.2), (0, 0, 0))).volume_m3(both.vertices[None], both.faces, None)
-    np.testing.assert_allclose(found, 0.06 * 0.04 * 0.04, atol=1e-12)
+    volume = overlap_of(box_at((0.2, 0.2, 0.2), (0, 0, 0))).volume_m3(both.vertices[None], both.faces, None)
+    np.testing.assert_allclose(volume, 0.06 * 0.04 * 0.04, atol=1e-12)
 
 
 def test_a_whole_hand_inside_has_the_hand_s_volume_closed_at_the_wrist() -> None:
     places = HAND.template_m - HAND.template_m.mean(axis=0)
     expected = volume_m3(*patched_holes(places, HAND.faces))
-    found = overlap_of(box_at((0.4, 0.4, 0.4), (0, 0, 0))).volume_m3(places[None], HAND.faces, None)
+    volume = overlap_of(box_at((0.4, 0.4, 0.4), (0, 0, 0))).volume_m3(places[None], HAND.faces, None)
     # The flat embedded hand does not enter itself, so that both ways to measure agree.
-    np.testing.assert_allclose(found, expected, rtol=2e-3)
+    np.testing.assert_allclose(volume, expected, rtol=2e-3)
     assert 1.5e-4 < expected < 6e-4
 
 
@@ -104,7 +104,7 @@ def test_the_hand_in_a_torus_has_the_volume_of_the_exact_intersection_of_the_mes
     overlap = overlap_of(torus)
     places = (HAND.template_m - HAND.template_m.mean(axis=0)) @ Rotation.from_rotvec([0.5, 1, -0.7]).as_matrix()
     places += np.array([0.05, 0.01, 0.01])
-    found = overlap.volume_m3(places[None], HAND.faces, None)[0]
+    volume = overlap.volume_m3(places[None], HAND.faces, None)[0]
     middle = places[_wrist_edge()].mean(axis=0)
     closed = np.concatenate([HAND.faces, _wrist_fan()])
     exact = cgal.mesh_boolean(
@@ -113,7 +113,7 @@ def test_the_hand_in_a_torus_has_the_volume_of_the_exact_intersection_of_the_mes
     corners = exact[0][exact[1]]
     expected = np.einsum("fx,fx->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
     assert expected > 5e-6
-    np.testing.assert_allclose(found, expected, rtol=0.01)
+    np.testing.assert_allclose(volume, expected, rtol=0.01)
 
 
 def _wrist_edge() -> np.ndarray:
@@ -127,14 +127,14 @@ def _wrist_fan() -> np.ndarray:
 
 
 @pytest.mark.parametrize("angle", [-1.0, 0.0, 2.0])
-def test_the_moving_part_is_met_where_the_hinge_has_turned_it(angle: float) -> None:
+def test_contacts_with_the_moving_part_follow_the_hinge(angle: float) -> None:
     model, hinge = tin(), tin().hinge
     assert hinge is not None
     cube = box_at((0.01, 0.01, 0.01), (0.02, 0, 0.03))
-    turn = Rotation.from_rotvec(hinge.axis * angle).as_matrix()
-    there = (cube.vertices - hinge.origin_m) @ turn.T + hinge.origin_m
-    found = SolidOverlap(SurfaceIndex(model)).volume_m3(there[None], cube.faces, np.array([angle]))
-    np.testing.assert_allclose(found, 1e-6, atol=1e-12)
+    rotation = Rotation.from_rotvec(hinge.axis * angle).as_matrix()
+    moved = (cube.vertices - hinge.origin_m) @ rotation.T + hinge.origin_m
+    volume = SolidOverlap(SurfaceIndex(model)).volume_m3(moved[None], cube.faces, np.array([angle]))
+    np.testing.assert_allclose(volume, 1e-6, atol=1e-12)
 
 
 def test_objects_without_inside_and_lattices_too_fine_are_refused() -> None:

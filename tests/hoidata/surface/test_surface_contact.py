@@ -48,18 +48,18 @@ def test_distances_equal_libigl_s_to_the_posed_mesh_in_the_world(
     index, hand = SurfaceIndex(model), placed_hand(clip, "right", HANDS)
     posed = track.points_in_world(model.vertices_m, model.part)
     vertices = track_vertices(clip.hands["right"], HANDS.right).astype(np.float64)
-    found, touched = signed_distances_m(hand, index, 0.05), touched_vertices(hand, index)
+    distances_m, touched = signed_distances_m(hand, index, 0.05), touched_vertices(hand, index)
     for frame in range(5):
         kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
         parts = [np.ascontiguousarray(model.faces[model.face_part == part], dtype=np.int64) for part in index.solids]
-        signed = np.stack([igl.signed_distance(vertices[frame], posed[frame], own, kind)[0] for own in parts])
+        signed = np.stack([igl.signed_distance(vertices[frame], posed[frame], faces, kind)[0] for faces in parts])
         expected = np.where((signed < 0).any(axis=0), signed.min(axis=0), np.abs(signed).min(axis=0))
         near = np.abs(expected) < 0.0499
-        np.testing.assert_allclose(found[frame][near], expected[near], atol=1e-7)
+        np.testing.assert_allclose(distances_m[frame][near], expected[near], atol=1e-7)
         clear = np.abs(np.abs(signed).min(axis=0) - 0.005) > 1e-7
         np.testing.assert_array_equal(touched[frame][clear], (np.abs(signed).min(axis=0) < 0.005)[clear])
     assert touched.any(axis=1).all()
-    assert np.nanmin(found) < 0
+    assert np.nanmin(distances_m) < 0
 
 
 def test_a_vertex_inside_has_its_depth_however_deep_and_one_outside_only_within_the_reach(make_clip) -> None:
@@ -84,16 +84,16 @@ def test_frames_without_the_hand_are_not_looked_at(make_clip: Callable[..., Clip
     assert np.isnan(deepest_m(placed_hand(gone, "right", HANDS), index)).all()
 
 
-def test_the_angle_of_a_hinge_is_that_of_its_own_frame_where_others_lack_the_hand(
+def test_each_valid_frame_uses_its_hinge_angle(
     make_clip: Callable[..., Clip],
 ) -> None:
     clip = shifted(make_clip(n_frames=6, articulated=True), 0.02)
     clip = with_object(clip, hinge_rad=np.linspace(-0.5, 2.0, 6).astype(np.float32))
     valid = np.array([False, True, False, True, True, False])
-    some = with_hand(clip, valid=valid)
+    with_gaps = with_hand(clip, valid=valid)
     index = SurfaceIndex(clip.object.model)
     overlap = SolidOverlap(index, 0.002)
-    whole, part = (placed_hand(each, "right", HANDS) for each in (clip, some))
+    whole, part = (placed_hand(each, "right", HANDS) for each in (clip, with_gaps))
     np.testing.assert_array_equal(
         signed_distances_m(part, index, 1.0)[valid], signed_distances_m(whole, index, 1.0)[valid]
     )
@@ -116,7 +116,7 @@ def test_deeper_hands_share_more_volume_and_a_far_hand_none(make_clip: Callable[
 
 
 @pytest.mark.parametrize("articulated", [False, True], ids=["rigid", "articulated"])
-def test_nothing_changes_when_the_world_moves(make_clip: Callable[..., Clip], articulated: bool) -> None:
+def test_results_do_not_depend_on_the_world_frame(make_clip: Callable[..., Clip], articulated: bool) -> None:
     clip = shifted(make_clip(n_frames=6, articulated=articulated), 0.02)
     moved = in_another_world(clip, Rotation.from_rotvec([0.4, -2.0, 1.0]), np.array([0.3, -0.2, 0.5]))
     index = SurfaceIndex(clip.object.model)
