@@ -318,10 +318,10 @@ def _json_files() -> dict[str, Target]:
     def values(*contents: object) -> Callable[[], list[bytes]]:
         return seed_files(*(json.dumps(content).encode() for content in contents))
 
-    def own_root(path: Path) -> Any:
+    def registered_root(path: Path) -> Any:
         os.environ.pop(base.root_variable("grab"), None)
         with contextlib.chdir(path.parent):
-            return base.own_root("grab")
+            return base.registered_root("grab")
 
     def settings(path: Path) -> Any:
         return base.load_settings(ConvertSettings, "convert", path)
@@ -342,7 +342,7 @@ def _json_files() -> dict[str, Target]:
         "hoi4d-json": Target(hoi4d_seeds, parse(_hoi4d_json), [hoi4d]),
         "oakink2-json": Target(oakink2_seeds, parse(_oakink2_json), [oakink2]),
         "hot3d-json": Target(hot3d_seeds, parse(_hot3d_json), [hot3d, sources]),
-        "hoidata-toml": Target(seed_files(TOML), on_disk("hoidata.toml", own_root), [base]),
+        "hoidata-toml": Target(seed_files(TOML), on_disk("hoidata.toml", registered_root), [base]),
         "params-yaml": Target(seed_files(PARAMS), on_disk("params.yaml", settings), [base, params]),
     }
 

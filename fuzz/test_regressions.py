@@ -18,7 +18,7 @@ from hoidata.store.mapped import map_npz
 from hoidata.store.store import open_store
 from pipelines.lineage.manifests import read_manifest
 from pipelines.stages.adapters import ConvertSettings
-from pipelines.stages.base import load_settings, own_root
+from pipelines.stages.base import load_settings, registered_root
 
 
 def archive(content: bytes, kind: int = zipfile.ZIP_STORED) -> bytes:
@@ -132,7 +132,7 @@ def test_settings_that_are_no_toml_are_bad_input(tmp_path: Path, monkeypatch: py
     monkeypatch.delenv("HOIDATA_GRAB", raising=False)
     Path("hoidata.toml").write_bytes(text.encode("utf-8", "surrogateescape"))
     with pytest.raises(BadInput, match=r"hoidata\.toml"):
-        own_root("grab")
+        registered_root("grab")
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,8 @@
-"""Trajectories, or frames of a stored clip, to fingers as files: what ``hoidata animate`` does."""
+"""`hoidata animate`: finger motion for a file of trajectories, or for frames of a stored clip (ManipNet)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from os.path import isfile  # of a name that is too long it says no, where a Path raises
+from os.path import isfile  # returns False for a name that is too long, where Path.is_file raises
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,40 +34,36 @@ from models.manipnet.network import ManipNet
 from models.manipnet.rollout import Predictor, Rule
 from models.manipnet.training import MANIPNET
 from models.manipnet.trajectory_files import ENDINGS, Axes, TrajectoryFile, read_trajectories
-from pipelines.command_inputs import MeshWish, stored_object, trained_on, trained_run
+from pipelines.command_inputs import MeshOptions, ProjectData, stored_object, trained_on, trained_run
 from pipelines.pages.motion_files import ARRAYS as SHARED
 from pipelines.pages.motion_files import MotionFiles, drawn, hand_shapes, motion_arrays, write_motions
 from pipelines.pages.player import motion_player
 from pipelines.showing import find_clip
 from pipelines.stages.base import StagePaths, load_hands
 
-Way = Literal["auto", "network", "interpolate"]
-ARRAYS = SHARED | {"made": "(S, F) whether the fingers were made here"}
+Method = Literal["auto", "network", "interpolate"]
+ARRAYS = SHARED | {"made": "(S, F) whether the fingers were generated"}
 UPS = {"": None, "x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 @dataclass(frozen=True)
-class AnimateWish:
-    """What a person asks for. sides: the hands to animate; both where the recording has them. frames: "30:90" or "".
+class AnimationOptions:
+    """The options of ``hoidata animate``."""
 
-    model: the dataset whose network to use, "" for the clip's own or the first there is. object, unit, axes, up, mesh:
-    of a file of trajectories. way: how frames of a clip are filled; "auto" for what was measured best for their length.
-    """
-
-    sides: tuple[Side, ...] = SIDES
-    frames: str = ""
-    model: str = ""
+    sides: tuple[Side, ...] = SIDES  # hands to animate, if the recording has them
+    frames: str = ""  # of a clip: "30:90", or "" for all
+    model: str = ""  # the dataset whose network to use; "" for the clip's dataset, else the first that has one
     rule: Rule = "ours"
-    object: str = ""
-    unit: str = ""
-    axes: Axes = "model"
-    up: str = ""
-    mesh: MeshWish = field(default_factory=MeshWish)
-    way: Way = "auto"
+    object: str = ""  # of a file of trajectories: a mesh file, or the name of an object of the dataset
+    unit: str = ""  # of positions in a file of trajectories
+    axes: Axes = "model"  # of the wrists in a file of trajectories
+    up: str = ""  # of a file of trajectories: the world axis that points up
+    mesh: MeshOptions = field(default_factory=MeshOptions)
+    method: Method = "auto"  # of filling frames of a clip; "auto" chooses by their number
 
-    def refuse_beside_clip(self) -> None:
-        """Raise BadInput where something is told that only a file of trajectories has."""
-        told = {
+    def check_for_clip(self) -> None:
+        """Raise BadInput for an option that applies only to a file of trajectories."""
+        file_options = {
             "--object": self.object,
             "--trajectory-unit": self.unit,
             "--wrist-axes": "" if self.axes == "model" else self.axes,
@@ -75,114 +71,123 @@ class AnimateWish:
             "--unit": self.mesh.unit,
             "--hinge": self.mesh.hinge,
         }
-        for option, value in told.items():
+        for option, value in file_options.items():
             if value:
-                raise BadInput(option, "nothing beside a clip, which says it itself", value, "leave it out")
+                raise BadInput(option, "no such option with a clip, which has this information", value, "omit it")
 
-    def refuse_beside_file(self) -> None:
-        """Raise BadInput where something is told that only a clip has."""
+    def check_for_file(self) -> None:
+        """Raise BadInput for an option that applies only to a clip."""
         if self.frames:
-            raise BadInput("--frames", "nothing beside a file of trajectories", self.frames, "cut the file")
-        if self.way == "interpolate":
-            remedy = "leave it out: a file of trajectories has no poses to go between"
-            raise BadInput("--way", "network or auto beside a file of trajectories", self.way, remedy)
+            raise BadInput("--frames", "no such option with a file of trajectories", self.frames, "cut the file")
+        if self.method == "interpolate":
+            remedy = "omit it: a file of trajectories has no poses to interpolate between"
+            raise BadInput("--way", "network or auto with a file of trajectories", self.method, remedy)
         if self.up not in UPS:
             raise BadInput("--world-up", "x, y or z", self.up, "name the axis of the file's world that points up")
 
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """A trained network, ready; rows of the page that say which; and what its checkpoint knows."""
+    """A trained network that predicts finger poses."""
 
     predictor: Predictor
-    rows: list[tuple[str, str]]
-    known: Mapping[str, Any]
+    rows: list[tuple[str, str]]  # (label, value) for the page
+    facts: Mapping[str, Any]  # in the header of its checkpoint
 
     @property
     def is_synthetic(self) -> bool:
-        """Whether it learnt from generated clips: its motion is synthetic then."""
-        return bool(self.known["synthetic"])
+        """Whether the training clips were generated; its motions then count as synthetic too."""
+        return bool(self.facts["synthetic"])
 
     def notes_on(self, clip_id: str) -> list[str]:
-        """Says where the clip is one that the network has seen."""
-        uses = {"train": "trained on this clip", "validation": "was chosen by this clip among others (validation)"}
-        return [f"the network {words}" for part, words in uses.items() if clip_id in self.known["clips"][part]]
+        """A note if the clip is one of the network's training or validation clips."""
+        uses = {"train": "trained on this clip", "validation": "was selected on this clip among others (validation)"}
+        return [f"the network {use}" for subset, use in uses.items() if clip_id in self.facts["clips"][subset]]
 
 
 @dataclass(frozen=True, eq=False)
-class Animated:
-    """clip: the motion. made: (2, frame) bool, where fingers were made. ghosts: the recorded hands behind them."""
+class Animation:
+    """An animated clip."""
 
     clip: Clip
-    made: np.ndarray
-    ghosts: Mapping[Side, HandTrack]
+    generated: np.ndarray  # (2, frame) bool, whether the fingers of the left and right hand were generated
+    ghosts: Mapping[Side, HandTrack]  # the recorded hands, shown transparent for comparison
     hands: HandPair
     facts: list[tuple[str, str]]
     notes: list[str]
 
 
-def animate_files(what: str, wish: AnimateWish, profile: str, datasets: tuple[str, ...], out: Path) -> list[Path]:
-    """Animate a stored clip (its id) or a file of trajectories (its path) into ``out``."""
-    animated = animate(what, wish, profile, datasets)
-    clip, hands, ghosts = animated.clip, animated.hands, animated.ghosts
+def animate_files(
+    source: str, options: AnimationOptions, profile: str, datasets: tuple[str, ...], out: Path
+) -> list[Path]:
+    """Animate a stored clip (its id) or a file of trajectories (its path), and write the result into ``out``."""
+    animation = animate(source, options, profile, datasets)
+    clip, hands, ghosts = animation.clip, animation.hands, animation.ghosts
     length = ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s")
     return write_motions(
         out,
         "animation.html",
-        [MotionFiles(clip, motion_arrays(clip, hands) | {"made": animated.made}, ghosts=ghosts)],
+        [MotionFiles(clip, motion_arrays(clip, hands) | {"made": animation.generated}, ghosts=ghosts)],
         hands,
         ARRAYS,
         title=clip.clip_id,
         ghost=bool(ghosts),
-        notes=animated.notes,
+        notes=animation.notes,
         player=motion_player(drawn(clip), hands, clip.clip_id, ghosts=ghosts),
-        facts=[*animated.facts, length, ("hand model", hands.name)],
+        facts=[*animation.facts, length, ("hand model", hands.name)],
     )
 
 
-def animate(what: str, wish: AnimateWish, profile: str, datasets: tuple[str, ...]) -> Animated:
-    """The same without files. Raises BadInput or MissingResource that says what cannot be, and what to do."""
-    make_repeatable(threads=1)  # one hand is too small for two threads to agree on
-    hands = load_hands(profile)
-    if Path(what).suffix.lower() in (*ENDINGS, ".gz") or isfile(what):
-        return _from_file(Path(what), wish, profile, datasets, hands)
-    return _from_clip(what, wish, profile, datasets, hands)
+def animate(source: str, options: AnimationOptions, profile: str, datasets: tuple[str, ...]) -> Animation:
+    """Animate a stored clip or a file of trajectories. Raises BadInput or MissingResource with a remedy."""
+    make_repeatable(threads=1)  # one hand is too small to gain from two threads
+    project = ProjectData(profile, datasets, load_hands(profile))
+    if Path(source).suffix.lower() in (*ENDINGS, ".gz") or isfile(source):
+        return _from_file(Path(source), options, project)
+    return _from_clip(source, options, project)
 
 
-def _from_clip(clip_id: str, wish: AnimateWish, profile: str, datasets: tuple[str, ...], hands: HandPair) -> Animated:
-    wish.refuse_beside_clip()
-    paths = _clip_paths(clip_id, profile, datasets)
+def _from_clip(clip_id: str, options: AnimationOptions, project: ProjectData) -> Animation:
+    options.check_for_clip()
+    hands, paths = project.hands, _clip_paths(clip_id, project)
     clip = load_annotated(paths.data, hands).clip(clip_id)
-    frames = _frames(wish.frames, clip.n_frames)
-    sides: list[Side] = [side for side in SIDES if side in wish.sides and clip.hands[side].valid.any()]
+    frames = _frames(options.frames, clip.n_frames)
+    sides: list[Side] = [side for side in SIDES if side in options.sides and clip.hands[side].valid.any()]
     if not sides:
-        raise BadInput("--fingers", "a hand that was tracked in the clip", ", ".join(wish.sides), "name the other one")
+        got = ", ".join(options.sides)
+        raise BadInput("--fingers", "a hand that was tracked in the clip", got, "name the other one")
     gaps: dict[Side, Gap] = {side: gap_of(clip.hands[side], frames) for side in sides}
-    straight = [side for side in sides if _is_straight(gaps[side], wish.way)]
-    network = None if straight == sides else chosen_network(wish, profile, (paths.dataset, *datasets), hands)
-    control, own, tracks = clip_control(clip), hands_of(hands, *hand_shapes(clip)), dict(clip.hands)
-    made = np.zeros((2, clip.n_frames), bool)
+    interpolated = [side for side in sides if _is_interpolated(gaps[side], options.method)]
+    network = None
+    if interpolated != sides:
+        datasets = (paths.dataset, *project.datasets)  # the networks of the clip's dataset come first
+        network = chosen_network(options, project._replace(datasets=datasets))
+    control, person_hands, tracks = clip_control(clip), hands_of(hands, *hand_shapes(clip)), dict(clip.hands)
+    generated = np.zeros((2, clip.n_frames), bool)
     for side, gap in gaps.items():
-        if network is None or side in straight:
+        if network is None or side in interpolated:
             fingers = straight_fingers(gap)
         else:
-            fingers = new_fingers(network.predictor, own[side], side, control, gap)
-        wanted = fingers[frames.start - gap.first : frames.stop - gap.first]
-        tracks[side] = with_fingers(clip.hands[side], frames, wanted, control.wrists[side])
-        made[SIDES.index(side), frames] = True
+            fingers = new_fingers(network.predictor, person_hands[side], side, control, gap)
+        # A gap includes the untracked frames around the requested ones.
+        requested = fingers[frames.start - gap.first : frames.stop - gap.first]
+        tracks[side] = with_fingers(clip.hands[side], frames, requested, control.wrists[side])
+        generated[SIDES.index(side), frames] = True
     rows = network.rows if network else []
-    rows = [*rows, ("made", f"{', '.join(sides)}, frames {frames.start} to {frames.stop - 1} of {clip.n_frames}")]
-    rows += [("way", f"{side}: {_way_words(gaps[side], side in straight)}") for side in sides]
+    rows = [*rows, ("generated", f"{', '.join(sides)}, frames {frames.start} to {frames.stop - 1} of {clip.n_frames}")]
+    rows += [("method", f"{side}: {_method_words(gaps[side], side in interpolated)}") for side in sides]
     notes = [note for side in sides for note in _lost_notes(side, clip.hands[side], frames)]
     notes += network.notes_on(clip_id) if network else []
-    shown = replace(clip, hands=tracks, synthetic=clip.synthetic or (network is not None and network.is_synthetic))
-    return Animated(shown, made, {side: clip.hands[side] for side in sides}, hands, rows, notes)
+    is_synthetic = clip.synthetic or (network is not None and network.is_synthetic)
+    ghosts: dict[Side, HandTrack] = {side: clip.hands[side] for side in sides}
+    animated = replace(clip, hands=tracks, synthetic=is_synthetic)
+    return Animation(animated, generated, ghosts, hands, facts=rows, notes=notes)
 
 
-def _clip_paths(clip_id: str, profile: str, datasets: tuple[str, ...]) -> StagePaths:
-    """Where the clip's dataset lies. Raises BadInput for an unknown id; one with an ending was meant as a file."""
+def _clip_paths(clip_id: str, project: ProjectData) -> StagePaths:
+    """The paths of the clip's dataset. Raises BadInput for an unknown id; a name with a suffix counts as a file."""
     try:
-        return find_clip(clip_id, profile, list(datasets))
+        return find_clip(clip_id, project.profile, list(project.datasets))
     except (BadInput, MissingResource) as error:
         if not Path(clip_id).suffix:
             raise
@@ -190,85 +195,88 @@ def _clip_paths(clip_id: str, profile: str, datasets: tuple[str, ...]) -> StageP
         raise BadInput(clip_id, expected, "no such file, and no such clip", "correct the path or its ending") from error
 
 
-def _is_straight(gap: Gap, way: Way) -> bool:
-    """Whether a gap is to be filled by interpolation. Raises BadInput where that is told and cannot be."""
-    if way == "interpolate" and (gap.before is None or gap.after is None):
-        got = "frames that begin or end where the hand is not known"
+def _is_interpolated(gap: Gap, method: Method) -> bool:
+    """Whether to fill a gap by interpolation. Raises BadInput if that is requested and impossible."""
+    if method == "interpolate" and (gap.before is None or gap.after is None):
+        got = "frames that begin or end where the hand is not tracked"
         raise BadInput("--way interpolate", "known poses on both sides of --frames", got, "--way network")
-    return way == "interpolate" or (way == "auto" and gap.is_short)
+    return method == "interpolate" or (method == "auto" and gap.is_short)
 
 
-def _way_words(gap: Gap, is_straight: bool) -> str:
-    if is_straight:
+def _method_words(gap: Gap, is_interpolated: bool) -> str:
+    if is_interpolated:
         return "interpolated between the known poses on both sides (docs/fingers.md: best up to 2 s)"
-    led = [words for words, pose in (("before", gap.before), ("after", gap.after)) if pose is not None]
-    return f"the network, led over 1 s to the known pose {' and '.join(led)}" if led else "the network"
+    blended = [words for words, pose in (("before", gap.before), ("after", gap.after)) if pose is not None]
+    if not blended:
+        return "the network"
+    return f"the network, blended over 1 s with the known pose {' and '.join(blended)}"
 
 
 def _lost_notes(side: Side, track: HandTrack, frames: slice) -> list[str]:
-    lost = int((~track.valid[frames]).sum())
-    total = frames.stop - frames.start
-    words = (
-        f"the {side} hand had been lost in {lost} of the {total} frames; there its wrist is where it was seen nearest"
-    )
-    return [words] if lost else []
+    n_lost = int((~track.valid[frames]).sum())
+    if not n_lost:
+        return []
+    n_frames = frames.stop - frames.start
+    return [
+        f"the {side} hand is not tracked in {n_lost} of the {n_frames} frames; "
+        "there its wrist has the pose of the nearest tracked frame"
+    ]
 
 
-def _from_file(path: Path, wish: AnimateWish, profile: str, datasets: tuple[str, ...], hands: HandPair) -> Animated:
-    wish.refuse_beside_file()
-    found = read_trajectories(path, wish.unit, wish.axes)
-    network = chosen_network(wish, profile, datasets, hands)
-    model, notes = _object(wish, wish.mesh.unit or found.mesh_unit, profile, datasets, hands)
-    own = hands_of(hands, np.zeros((2, 10), np.float32), None)
-    given = given_control(found, model, own)
-    notes += [*given.notes, *_left_notes(found, given, wish.sides)]
+def _from_file(path: Path, options: AnimationOptions, project: ProjectData) -> Animation:
+    options.check_for_file()
+    trajectories = read_trajectories(path, options.unit, options.axes)
+    network = chosen_network(options, project)
+    model, notes = _object(options, options.mesh.unit or trajectories.mesh_unit, project)
+    mean_hands = hands_of(project.hands, np.zeros((2, 10), np.float32), None)
+    given = given_control(trajectories, model, mean_hands)
+    notes += [*given.notes, *_skipped_hand_notes(trajectories, given, options.sides)]
     control = at_30_fps(given.control)
-    made, fingers = np.zeros((2, len(control.object_motion.time_s)), bool), dict[Side, np.ndarray]()
-    for side in found.wrists:
-        fingers[side] = np.tile(own[side].rest_rotmats, (made.shape[1], 1, 1, 1))
-        if side in given.active and side in wish.sides:
-            gap = Gap(0, made.shape[1], None, None)
-            fingers[side] = new_fingers(network.predictor, own[side], side, control, gap)
-            made[SIDES.index(side)] = True
-    clip = clip_of(control, fingers, found.up or UPS[wish.up], path.stem, network.is_synthetic)
-    return Animated(clip, made, {}, hands, [*network.rows, ("object", model.name)], notes)
+    n_frames = len(control.object_motion.time_s)
+    generated, fingers = np.zeros((2, n_frames), bool), dict[Side, np.ndarray]()
+    for side in trajectories.wrists:
+        fingers[side] = np.tile(mean_hands[side].rest_rotmats, (n_frames, 1, 1, 1))
+        if side in given.active and side in options.sides:
+            gap = Gap(0, n_frames, None, None)
+            fingers[side] = new_fingers(network.predictor, mean_hands[side], side, control, gap)
+            generated[SIDES.index(side)] = True
+    clip = clip_of(control, fingers, trajectories.up or UPS[options.up], path.stem, network.is_synthetic)
+    return Animation(clip, generated, {}, project.hands, facts=[*network.rows, ("object", model.name)], notes=notes)
 
 
-def _left_notes(found: TrajectoryFile, given: Given, sides: tuple[Side, ...]) -> list[str]:
-    """Says which hands at the object were not asked for. Raises BadInput where none of those asked for is there."""
+def _skipped_hand_notes(trajectories: TrajectoryFile, given: Given, sides: tuple[Side, ...]) -> list[str]:
+    """A note per hand near the object that was not requested. Raises BadInput if no requested hand is near it."""
     if not set(given.active) & set(sides):
-        there = f"{found.source} has {' and '.join(found.wrists)}, near the object {' and '.join(given.active)}"
-        raise BadInput(
-            "--fingers", "a hand that is in the file and near the object", sides[0], f"name another: {there}"
-        )
-    left = [side for side in given.active if side not in sides]
-    return [f"the {side} hand was not asked for (--fingers) and keeps its neutral pose" for side in left]
+        present = f"{trajectories.source} has {' and '.join(trajectories.wrists)}"
+        remedy = f"name another: {present}, near the object {' and '.join(given.active)}"
+        raise BadInput("--fingers", "a hand that is in the file and near the object", sides[0], remedy)
+    skipped = [side for side in given.active if side not in sides]
+    return [f"the {side} hand was not requested (--fingers) and keeps its neutral pose" for side in skipped]
 
 
-def _object(
-    wish: AnimateWish, unit: str, profile: str, datasets: tuple[str, ...], hands: HandPair
-) -> tuple[ObjectModel, list[str]]:
-    """A mesh file in its own axes, or an object of the dataset; and what is to be said of it."""
-    if isfile(wish.object):
-        # Trajectories say how the mesh lies: it is not turned upright.
-        user = read_user_object(Path(wish.object), unit, "z", wish.mesh.hinge)
+def _object(options: AnimationOptions, unit: str, project: ProjectData) -> tuple[ObjectModel, list[str]]:
+    """A mesh file in its stored axes, or an object of the dataset; and notes for the user."""
+    if isfile(options.object):
+        # The trajectories give the mesh's orientation, so the mesh is not rotated upright.
+        user = read_user_object(Path(options.object), unit, "z", options.mesh.hinge)
         return user.model, list(user.notes)
-    if not wish.object:
+    if not options.object:
         raise BadInput("--object", "the mesh of the object (.obj, .ply, .stl, .glb)", "none", "name it")
-    return stored_object(wish.object, StagePaths(profile, wish.model or datasets[0]).clips, hands), []
+    paths = StagePaths(project.profile, options.model or project.datasets[0])
+    return stored_object(options.object, paths.clips, project.hands), []
 
 
-def chosen_network(wish: AnimateWish, profile: str, datasets: tuple[str, ...], hands: HandPair) -> Network:
-    """The trained network of the dataset asked for, or of the first that has one."""
-    paths, facts = trained_run("manipnet", [MANIPNET.name], wish.model, profile, datasets, hands)
+def chosen_network(options: AnimationOptions, project: ProjectData) -> Network:
+    """The trained network of the requested dataset, or of the first dataset that has one."""
+    paths, facts = trained_run("manipnet", [MANIPNET.name], options.model, project)
     checkpoint = load_checkpoint(paths.checkpoints / MANIPNET.name, MANIPNET, torch.device("cpu"))
     assert isinstance(checkpoint.network, ManipNet)
-    rows = [("network", str(paths)), ("trained on", trained_on(facts)), ("post-processing", wish.rule)]
-    return Network(Predictor(checkpoint.network, wish.rule), rows, facts)
+    rows = [("network", str(paths)), ("trained on", trained_on(facts)), ("post-processing", options.rule)]
+    return Network(Predictor(checkpoint.network, options.rule), rows, facts)
 
 
 def _frames(text: str, n_frames: int) -> slice:
-    """ "30:90" as frames 30 to 89; "" for all."""
+    """Frames 30 to 89 for "30:90"; all frames for ""."""
     first, colon, last = text.partition(":")
     try:
         start, stop = int(first or 0), int(last or n_frames)

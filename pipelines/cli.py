@@ -1,4 +1,4 @@
-"""The ``hoidata`` command. Every sub-command imports what it needs when it runs, so that ``--help`` is quick."""
+"""The ``hoidata`` command. Sub-commands import their modules when they run, so that ``--help`` is fast."""
 
 import sys
 from io import TextIOWrapper
@@ -31,9 +31,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.add_typer(synth.app, name="synth", help="The corpora made here: write them, check their physics.")
-app.add_typer(adapters.app, name="adapters", help="Readers of datasets: list them, check that one keeps the rules.")
-app.add_typer(raw.app, name="raw", help="Your own raw files: scan them into a manifest, verify them.")
+app.add_typer(synth.app, name="synth", help="Write the generated corpora, or check their physics.")
+app.add_typer(adapters.app, name="adapters", help="List the dataset adapters, or check one.")
+app.add_typer(raw.app, name="raw", help="Scan your raw files into a manifest, or verify them.")
 app.add_typer(lineage.app, name="lineage")
 app.command("init")(init.init)
 app.command("convert")(adapters.convert)
@@ -58,18 +58,17 @@ app.command("export")(export.export)
 
 
 @app.callback()
-def _check_what_is_read() -> None:
+def _check_digests_of_read_files() -> None:
     from hoidata.files.written import verify_with
 
     verify_with(_written_digest)
 
 
 def main() -> None:
-    """Run the command. Exit code 1 and one line on stderr when something is wrong with what it was given, or with the
-    machine (a full disk, a folder that cannot be written)."""
+    """Run the command. Bad input and machine errors (such as a full disk) give one line on stderr and exit code 1."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a file name need not be UTF-8
+            stream.reconfigure(errors="backslashreplace")  # file names may have bytes that are not UTF-8
     try:
         with told_in_words():
             app()

@@ -1,10 +1,10 @@
-"""What the commands that make motions are given, the object and the trained networks, and what they give back."""
+"""Inputs and results that `hoidata generate`, `animate` and `hands` share: mesh options, objects, trained networks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
@@ -15,9 +15,17 @@ from models.common.checkpoints import FILE_NAME, read_info
 from pipelines.stages.base import StagePaths
 
 
+class ProjectData(NamedTuple):
+    """The profile, datasets and hand model that a command works with."""
+
+    profile: str
+    datasets: tuple[str, ...]  # of params.yaml
+    hands: HandPair
+
+
 @dataclass(frozen=True)
-class MeshWish:
-    """How to read the user's mesh file; "" for what is to be assumed or found, as in ``read_user_object``."""
+class MeshOptions:
+    """How to read the user's mesh file, as in ``read_user_object``; "" uses the default or a guess."""
 
     unit: str = ""
     up: str = ""
@@ -25,15 +33,15 @@ class MeshWish:
 
 
 @dataclass(frozen=True)
-class Written:
-    """paths of the files; notes: what was assumed, chosen or never seen in training, for the person who asked."""
+class WrittenFiles:
+    """The result of a command that writes motions."""
 
     paths: list[Path]
-    notes: list[str]
+    notes: list[str]  # assumptions, choices and unknown words, to print for the user
 
 
 def stored_object(name: str, clips: Path, hands: HandPair) -> ObjectModel:
-    """An object of the dataset by name. Raises BadInput that lists the names there are."""
+    """An object of a store of clips. Raises BadInput that lists the store's objects."""
     store = open_store(clips, hands)
     names = list(store.objects["object"])
     if name not in names:
@@ -43,50 +51,62 @@ def stored_object(name: str, clips: Path, hands: HandPair) -> ObjectModel:
 
 
 def nearest_name(name: str, names: Sequence[str]) -> str:
-    """Which of the names was likely meant, as a question; empty where none is near."""
-    near = get_close_matches(name, names, 1)
-    return f"did you mean {near[0]!r}?" if near else ""
+    """A question that suggests the most similar of ``names``; empty if none is similar."""
+    matches = get_close_matches(name, names, 1)
+    return f"did you mean {matches[0]!r}?" if matches else ""
 
 
 def mesh_notes(model: ObjectModel) -> list[str]:
-    """What was repaired of a mesh, and which parts of it have no inside that hands could be kept out of."""
+    """Notes on repairs of a mesh, and on parts without an inside, where penetration is not prevented."""
     index = surface_index(model)
     note = [] if index.solid_note is None else [f"mesh: {index.solid_note}"]
-    return note if index.is_solid else [f"{note[0]}; hands are drawn to its surface, not kept out of it"]
+    return (
+        note if index.is_solid else [f"{note[0]}; hands are attracted to its surface, but penetration is not prevented"]
+    )
 
 
 def trained_run(
-    family: str, networks: Sequence[str], model: str, profile: str, datasets: Sequence[str], hands: HandPair
+    family: str, networks: Sequence[str], model: str, project: ProjectData
 ) -> tuple[StagePaths, Mapping[str, Any]]:
-    """The dataset asked for, or the first that has these networks, and the facts of the last network.
+    """The first dataset that has all of these networks, or the one that is named.
 
-    model: the dataset, or "". Raises MissingResource where none is trained, BadInput for another hand.
+    Args:
+        family: the model family, for error messages.
+        networks: names of the networks; all must be trained.
+        model: the dataset to use, or "" for the first one that has them.
+        project: the datasets, and the hand model that the networks must have been trained with.
+
+    Returns:
+        The paths of the dataset, and the facts in the header of the last network.
+
+    Raises:
+        MissingResource: no dataset has the networks.
+        BadInput: the networks were trained with another hand model.
     """
-    check_dataset(model, profile, datasets)
-    runs = [StagePaths(profile, name) for name in ((model,) if model else dict.fromkeys(datasets))]
+    check_dataset(model, project)
+    runs = [StagePaths(project.profile, name) for name in ((model,) if model else dict.fromkeys(project.datasets))]
     trained = [run for run in runs if all((run.checkpoints / name / FILE_NAME).is_file() for name in networks)]
     if not trained:
-        where = ", ".join(map(str, runs))
         remedy = f"name a dataset under family_datasets.{family} in params.yaml, then `hoidata repro`"
-        raise MissingResource(f"no networks of {family} ({where}): {remedy}")
-    each = {name: read_info(trained[0].checkpoints / name / FILE_NAME)["facts"] for name in networks}
-    for name, facts in each.items():
-        if facts["hand_digest"] != hands.digest:
+        raise MissingResource(f"no networks of {family} ({', '.join(map(str, runs))}): {remedy}")
+    facts = {name: read_info(trained[0].checkpoints / name / FILE_NAME)["facts"] for name in networks}
+    for name, header in facts.items():
+        if header["hand_digest"] != project.hands.digest:
             remedy = "train it with the hand of this profile"
-            raise BadInput(trained[0].checkpoints / name, f"hand {facts['hand']}", hands.name, remedy)
-    return trained[0], each[networks[-1]]
+            raise BadInput(trained[0].checkpoints / name, f"hand {header['hand']}", project.hands.name, remedy)
+    return trained[0], facts[networks[-1]]
 
 
-def check_dataset(name: str, profile: str, datasets: Sequence[str]) -> None:
-    """Raise BadInput that lists the datasets of params.yaml for an unknown one; "" is none."""
-    paths = StagePaths(profile, name)
-    if name and name not in datasets and not paths.data.is_dir() and not paths.checkpoints.is_dir():
-        known = list(dict.fromkeys(datasets))
-        remedy = nearest_name(name, known) or "name one of them, or leave it out"
-        raise BadInput("--model", f"a dataset of params.yaml: {', '.join(known)}", name, remedy)
+def check_dataset(name: str, project: ProjectData) -> None:
+    """Raise BadInput that lists the datasets of params.yaml if ``name`` is unknown; "" is accepted."""
+    paths = StagePaths(project.profile, name)
+    if name and name not in project.datasets and not paths.data.is_dir() and not paths.checkpoints.is_dir():
+        names = list(dict.fromkeys(project.datasets))
+        remedy = nearest_name(name, names) or "name one of them, or omit the option"
+        raise BadInput("--model", f"a dataset of params.yaml: {', '.join(names)}", name, remedy)
 
 
 def trained_on(facts: Mapping[str, Any]) -> str:
-    """How many clips of which datasets a network learned from, in words."""
+    """The number of training clips of a network per dataset, in words."""
     kind = "SYNTHETIC" if facts["synthetic"] else "recorded"
     return ", ".join(f"{count} {kind} {name} clips" for name, count in facts["datasets"].items())

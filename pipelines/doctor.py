@@ -1,4 +1,4 @@
-"""What is installed and found on this machine, part by part."""
+"""`hoidata doctor`: the state of installed packages, raw files, hand models, text encoder and GPU."""
 
 import os
 import sys
@@ -12,7 +12,7 @@ from hoidata.errors import HoidataError
 from pipelines.lineage.manifests import Manifest
 from pipelines.params import PROFILES, read_params
 from pipelines.stages.adapters import manifest_of, source_of
-from pipelines.stages.base import HAND, StagePaths, load_hands, load_settings, own_root, root_variable
+from pipelines.stages.base import HAND, StagePaths, load_hands, load_settings, registered_root, root_variable
 
 PYTHONS = ((3, 11), (3, 12), (3, 13))
 NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "safetensors", "dvc", "prefect")
@@ -20,15 +20,15 @@ NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "
 
 @dataclass(frozen=True)
 class Finding:
-    """One part: ``ok``, ``absent`` (optional, not there) or ``broken`` (needed, not usable)."""
+    """The state of one part."""
 
     part: str
-    state: Literal["ok", "absent", "broken"]
-    found: str
+    state: Literal["ok", "absent", "broken"]  # absent: optional and missing; broken: required and not usable
+    detail: str
 
 
 def examine() -> list[Finding]:
-    """Look at everything a run depends on; opens no raw file and starts nothing."""
+    """Examine everything that a run depends on, without opening raw files."""
     params = read_params(Path())
     profile = Finding("profile", "ok", params["profile"])
     findings = [_python(), *map(_package, NEEDED), _prefect_server(), _gpu(), profile]
@@ -52,7 +52,7 @@ def _package(name: str) -> Finding:
 
 
 def _prefect_server() -> Finding:
-    """Whether Prefect's server can be imported: a FastAPI that is too new breaks it while `pip check` is content."""
+    """Whether Prefect's server can be imported: too new a FastAPI breaks it, which `pip check` does not detect."""
     try:
         import prefect.server.api.server  # noqa: F401
     except (ImportError, TypeError) as error:
@@ -74,18 +74,18 @@ def _raw(profile: str, dataset: str) -> Finding:
         manifest = manifest_of(paths)
     except HoidataError as error:
         return Finding(part, "broken", str(error))
-    root = own_root(dataset) or own_root(source_of(dataset)) if profile == "own" else paths.generated_raw
+    root = registered_root(dataset) or registered_root(source_of(dataset)) if profile == "own" else paths.generated_raw
     if not manifest.present:
         return Finding(part, "absent", _why_absent(profile, manifest, root))
     if root is None or not root.is_dir():
-        remedy = f"set {root_variable(dataset)}" if profile == "own" else "written by the stage raw"
-        return Finding(part, "absent", f"manifest is there, files are not; {remedy}")
+        remedy = f"set {root_variable(dataset)}" if profile == "own" else "the stage raw writes them"
+        return Finding(part, "absent", f"the manifest exists, the files do not; {remedy}")
     return Finding(part, "ok", f"{root}{' (synthetic)' if manifest.synthetic else ''}")
 
 
 def _why_absent(profile: str, manifest: Manifest, root: Path | None) -> str:
     if profile != "own":
-        return f"has no corpus in the profile {profile}"
+        return f"the profile {profile} has no corpus of it"
     if root:
         return f"{root} is not scanned; run `hoidata raw scan {manifest.dataset} --root {root}`"
     return f"get it at: {manifest.where_to_register}"
@@ -116,4 +116,4 @@ def _encoder() -> Finding:
 def _clip() -> Finding:
     if find_spec("open_clip") is None:
         return Finding("CLIP", "absent", "optional; pip install -c constraints.txt -e '.[clip]'")
-    return Finding("CLIP", "ok", f"open_clip {version('open_clip_torch')}; weights are yours to provide")
+    return Finding("CLIP", "ok", f"open_clip {version('open_clip_torch')}; you provide the weights")

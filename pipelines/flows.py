@@ -1,6 +1,6 @@
-"""The Prefect flow, which brings DVC targets up to date with a task per stage, and the deployments of the graph.
+"""The Prefect flow that updates DVC targets with a task per stage, and the deployments of the graph.
 
-``python -m pipelines.flows`` registers the deployments and runs their flows until it is ended; `hoidata up` starts it.
+``python -m pipelines.flows`` registers the deployments and serves their flows; `hoidata up` starts and stops it.
 """
 
 import asyncio
@@ -25,26 +25,28 @@ from pipelines.repro import reproduce
 from pipelines.run_facts import describe_results
 from pipelines.side_by_side import RunStage, describe_run, log_of
 
-# How DVC tells that the system ended a stage, most often for want of memory: worth a second try, unlike its own errors.
+# DVC's message for a stage that the system killed, most often for lack of memory. Such a stage is tried again.
 KILLED = "exited with -9"
 WHOLE_GRAPH = "full-graph"
-# Stages that can be run by themselves; the stages before each of them are brought up to date with it.
-WORK = ("convert", "annotate", "contact", "evaluate")
+# Stages with a deployment each, which also updates the stages before it.
+DEPLOYED_STAGES = ("convert", "annotate", "contact", "evaluate")
 READY = "ready: run `prefect deployment run annotate-arctic` in another terminal, in this folder"
 Targets = dict[str, list[str]]
 
 
 class StageError(RuntimeError):
-    """A stage ended with an error; its log says why."""
+    """A stage failed; its log has the reason."""
 
 
 @flow(name="bring-up-to-date")
 def bring_up_to_date(targets: list[str], profile: str = "", jobs: int = 0, force: bool = False) -> None:
-    """Bring DVC targets up to date.
+    """Update DVC targets.
 
-    targets: as ``dvc repro`` takes them, ``{profile}`` for the profile; empty: the whole graph.
-    profile: the one to choose first, as `hoidata profile` does; empty: the one that is chosen.
-    jobs: stages at once; 0: one per core, at most 4. force: run the targets themselves even where nothing changed.
+    Args:
+        targets: as for ``dvc repro``, with ``{profile}`` for the profile; empty: the whole graph.
+        profile: the profile to choose first, as `hoidata profile` does; empty: the current one.
+        jobs: number of parallel stages; 0: one per core, at most 4.
+        force: run the targets even if nothing has changed.
     """
     if profile:
         if profile not in PROFILES:
@@ -52,14 +54,14 @@ def bring_up_to_date(targets: list[str], profile: str = "", jobs: int = 0, force
         set_profile(profile)
     chosen = current_profile()
     run = reproduce([target.replace("{profile}", chosen) for target in targets], jobs, stages_as_tasks, force)
-    create_markdown_artifact(f"```\n{describe_run(run)}\n```", key="stages", description="where the time went")
-    create_markdown_artifact(describe_results(Path(), chosen), key="results", description="what there is now")
+    create_markdown_artifact(f"```\n{describe_run(run)}\n```", key="stages", description="duration of each stage")
+    create_markdown_artifact(describe_results(Path(), chosen), key="results", description="clips and metrics")
     if run.failed:
         raise StageError("; ".join(f"{name} failed, see {log_of(name)}" for name in run.failed))
 
 
 def stages_as_tasks(run_stage: RunStage) -> RunStage:
-    """Each stage as a Prefect task with its state, log and duration."""
+    """Wrap ``run_stage`` so that each stage is a Prefect task with state, log and duration."""
 
     @task(name="stage", task_run_name="{name}", retries=1, retry_condition_fn=_was_killed)
     def stage(name: str) -> None:
@@ -82,37 +84,37 @@ def _was_killed(_task, _run, state) -> bool:
 def deployment_targets(graph: dict[str, Stage], profile: str, datasets: list[str]) -> Targets:
     """DVC targets by deployment name, such as annotate-arctic, train-grab-text2hoi or evaluate-h2o.
 
-    ``{profile}`` stands for the profile, which is chosen when a run starts.
+    Targets have ``{profile}`` in place of the profile, which is set when a run starts.
     """
-    found: Targets = {WHOLE_GRAPH: []}
+    targets: Targets = {WHOLE_GRAPH: []}
     for dataset in datasets:
-        at = f"@{profile}-{dataset}"
+        suffix = f"@{profile}-{dataset}"
         for name in graph:
-            address, sign, rest = name.partition(at)
-            if not sign or rest[:1] not in ("", "-"):
-                continue  # of another dataset, or of no dataset
+            address, sign, network = name.partition(suffix)
+            if not sign or network[:1] not in ("", "-"):
+                continue  # a stage of another dataset, or of none
             if key := _deployment_name(address, dataset):
-                found.setdefault(key, []).append(f"{address}@{{profile}}-{dataset}{rest}")
-    return found
+                targets.setdefault(key, []).append(f"{address}@{{profile}}-{dataset}{network}")
+    return targets
 
 
 def _deployment_name(address: str, dataset: str) -> str:
-    """The deployment a stage belongs to; empty for stages nobody asks for by themselves."""
-    work = address.rpartition(":")[2]
-    if work in WORK:
-        return f"{work}-{dataset}"
-    return f"train-{dataset}-{Path(address).parent.name}" if work.split("-")[0] == "train" else ""
+    """The deployment that a stage belongs to; empty if it has none."""
+    stage = address.rpartition(":")[2]
+    if stage in DEPLOYED_STAGES:
+        return f"{stage}-{dataset}"
+    return f"train-{dataset}-{Path(address).parent.name}" if stage.split("-")[0] == "train" else ""
 
 
 def make_deployments(project: Path) -> list[RunnerDeployment]:
-    """The deployments of this project's graph; the one schedule of each is inactive."""
+    """The deployments of this project's graph, each with an inactive weekly schedule."""
     params = read_params(project)
     targets = deployment_targets(read_graph(project), params["profile"], params["datasets"])
     return [
         RunnerDeployment.from_flow(
             bring_up_to_date,
             name,
-            description=f"Brings {', '.join(targets[name]) or 'the report'}, and all it is made from, up to date.",
+            description=f"Updates {', '.join(targets[name]) or 'the report'} and all stages before it.",
             parameters={"targets": targets[name], "profile": "", "jobs": 0, "force": False},
             schedules=[Cron("0 3 * * 1", timezone="UTC", active=False)],
             concurrency_limit=1,
@@ -122,26 +124,26 @@ def make_deployments(project: Path) -> list[RunnerDeployment]:
 
 
 def end_abandoned_runs() -> None:
-    """Mark runs as crashed whose `hoidata up` has ended; each would keep its deployment's only place for ever.
+    """Mark runs of an earlier `hoidata up` as crashed, since a deployment runs only one at a time.
 
-    For the moment before flows are served, when nothing can be under way in this folder.
+    Called before flows are served, when no run of this folder can be active.
     """
-    under_way = [StateType.RUNNING, StateType.PENDING, StateType.CANCELLING]
-    state = FlowRunFilterState(type=FlowRunFilterStateType(any_=under_way))
+    active = [StateType.RUNNING, StateType.PENDING, StateType.CANCELLING]
+    state = FlowRunFilterState(type=FlowRunFilterStateType(any_=active))
     with get_client(sync_client=True) as client:
         for run in client.read_flow_runs(flow_run_filter=FlowRunFilter(state=state)):
             client.set_flow_run_state(run.id, Crashed(message="its `hoidata up` ended before it did"))
-            print(f"{run.name}: its `hoidata up` ended before it did; a new run completes what it began")
+            print(f"{run.name}: its `hoidata up` ended before it did; a new run resumes its work")
 
 
 def serve_flows() -> None:
-    """Register the deployments of this folder and start a process for each run that is asked for.
+    """Register the deployments of this folder and start a process for each requested run.
 
-    Only the deployment decides what that process runs: ``prefect.engine`` with the flow above.
+    The process always runs ``prefect.engine`` with the flow above, whatever the run specifies.
     """
     end_abandoned_runs()
     runner = Runner(pause_on_shutdown=False, limit=None)
-    runner._tmp_dir = KEY_FILE.parent.resolve() / "runner"  # Prefect's own choice is a folder that all users share
+    runner._tmp_dir = KEY_FILE.parent.resolve() / "runner"  # Prefect's default is a folder that all users share
     for deployment in make_deployments(Path()):
         runner.add_deployment(deployment)
     print(READY, flush=True)

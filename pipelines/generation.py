@@ -1,4 +1,4 @@
-"""A sentence and an object to motions, with the models of the dataset that knows its words best, as files."""
+"""`hoidata generate`: motions for a sentence and an object, with the models that fit the sentence best."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,7 +25,7 @@ from models.text2hoi.generation import GeneratedMotion, Generator, Wish
 from models.text2hoi.sampler import SamplingConfig
 from models.text2hoi.sentences import further_verbs, read_sentence
 from models.text2hoi.wording import Wording, understood_words
-from pipelines.command_inputs import MeshWish, Written, mesh_notes, stored_object
+from pipelines.command_inputs import MeshOptions, WrittenFiles, mesh_notes, stored_object
 from pipelines.pages.generation_page import write_generation
 from pipelines.params import chosen_params, read_file
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
@@ -33,188 +33,192 @@ from pipelines.stages.base import StagePaths, empty_reason, load_hands
 
 @dataclass(frozen=True)
 class Models:
-    """Trained networks and what they were trained with. clips: the store whose objects may be asked for by name.
+    """Trained networks of one dataset, with the hand model and text encoder they were trained with."""
 
-    sampling: how motions are made. points: sampled on an object.
-    """
-
-    checkpoints: Path
+    checkpoints: Path  # the folder with one subfolder per network
     hands: HandPair
     encoder: TextEncoder
-    clips: Path | None = None
+    clips: Path | None = None  # the store whose objects can be requested by name
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
-    points: int = ContactSettings.points
+    points: int = ContactSettings.points  # sampled on the object's surface
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Everything ``hoidata generate`` is told. object: a mesh file, or the name of an object of the dataset.
-
-    model: the dataset whose models to use, or "" for the one that knows the sentence's words best. models: these, in
-    place of a project's. sampler: fields of a SamplerConfig, over those of the models. force: generate even where words
-    of the sentence are unknown, and leave them as they are.
-    """
+class GenerationRequest:
+    """The arguments of ``hoidata generate``."""
 
     text: str
-    object: str | Path
+    object: str | Path  # a mesh file, or the name of an object of a dataset
     profile: str = ""
     datasets: tuple[str, ...] = ()
-    model: str = ""
-    models: Models | None = None
+    model: str = ""  # the dataset whose models to use; "" chooses it by the words of the sentence
+    models: Models | None = None  # used instead of the project's models
     wish: Wish = field(default_factory=Wish)
-    mesh: MeshWish = field(default_factory=MeshWish)
-    sampler: Mapping[str, Any] = field(default_factory=dict)
-    force: bool = False
+    mesh: MeshOptions = field(default_factory=MeshOptions)
+    sampler: Mapping[str, Any] = field(default_factory=dict)  # fields of SamplerConfig that replace the models' own
+    force: bool = False  # generate even if the sentence has unknown words, and keep those words
 
 
-def generate_files(asked: Asked, out: Path) -> Written:
-    """Generate, and write arrays, an animated GLB and a page that plays it into ``out``.
+def generate_files(request: GenerationRequest, out: Path) -> WrittenFiles:
+    """Generate motions; write arrays, an animated GLB and a page with a player into ``out``.
 
-    Raises MissingResource or BadInput that says what is not there or cannot be meant.
+    Raises:
+        MissingResource: models or files are missing.
+        BadInput: the sentence, the object or an option is not usable.
     """
-    read_sentence(asked.text)  # refuses what is no sentence before anything is loaded
+    read_sentence(request.text)  # refuses other text before anything is loaded
     notes: list[str] = []
     user = None
-    if isinstance(asked.object, Path):
-        user = read_user_object(asked.object, asked.mesh.unit, asked.mesh.up, asked.mesh.hinge)
+    if isinstance(request.object, Path):
+        user = read_user_object(request.object, request.mesh.unit, request.mesh.up, request.mesh.hinge)
         notes += [*user.notes, *mesh_notes(user.model)]
-    wording = _wording(asked)
-    verb, thing = wording.verb, wording.noun
-    models, why = (asked.models, "") if asked.models else _of_project(asked, verb, thing)
-    notes += [*wording.notes, *([why] if why else [])]
-    make_repeatable(threads=1)  # one motion is too small for two threads to agree on
+    wording = _wording(request)
+    verb, noun = wording.verb, wording.noun
+    models, reason = (request.models, "") if request.models else _project_models(request, verb, noun)
+    notes += [*wording.notes, *([reason] if reason else [])]
+    make_repeatable(threads=1)  # one motion is too small to gain from two threads
     hands = models.hands
-    model = user.model if user else _stored_object(str(asked.object), models)
-    notes += _no_hinge(verb, asked.object, model)
-    sampling = replace(models.sampling, sampler=replace(models.sampling.sampler, **asked.sampler))
+    model = user.model if user else _stored_object(str(request.object), models)
+    notes += _missing_hinge_notes(verb, request.object, model)
+    sampling = replace(models.sampling, sampler=replace(models.sampling.sampler, **request.sampler))
     generator = Generator.load(models.checkpoints, hands, models.encoder, sampling=sampling, points=models.points)
-    motions = generator.generate(wording.text, model, asked.wish, wording.noun if user else None)
+    motions = generator.generate(wording.text, model, request.wish, noun if user else None)
     evidence, hand = motions[0].evidence, motions[0].evidence["hand"]
     if hand["source"] != "rule":
         notes.append(f"hand: {hand['hand']}, since {hand['evidence']} (--hand chooses another)")
-    if evidence["read_as"] is None:  # networks that see the whole sentence
+    if evidence["read_as"] is None:  # only networks without a verb classifier see the unknown words
         notes += [f"never seen: {note}" for note in evidence["unseen"]]
-    notes += _not_made(wording.text, evidence["read_as"], verb, generator.vocabulary)
-    notes += [*_taken_for(verb, evidence), *_faults(motions)]
-    return Written(write_generation(out, motions, hands, str(models.checkpoints), notes), notes)
+    notes += _further_verb_notes(wording.text, evidence["read_as"], verb, generator.vocabulary)
+    notes += [*_classified_verb_notes(verb, evidence), *_fault_notes(motions)]
+    return WrittenFiles(write_generation(out, motions, hands, str(models.checkpoints), notes), notes)
 
 
-def _no_hinge(verb: str | None, object: str | Path, model: ObjectModel) -> list[str]:
-    """That the verb turns a hinge and the object has none, and what to add; for a person."""
-    least, most = written_limits().get(verb or "", {}).get("hinge_net_deg", (0.0, 0.0))
-    if model.is_articulated or least <= 0 <= most:
+def _missing_hinge_notes(verb: str | None, object: str | Path, model: ObjectModel) -> list[str]:
+    """A note for a verb that turns a hinge and an object without one, with the remedy."""
+    lowest_deg, highest_deg = written_limits().get(verb or "", {}).get("hinge_net_deg", (0.0, 0.0))
+    if model.is_articulated or lowest_deg <= 0 <= highest_deg:
         return []
-    says = f"{verb!r} turns a hinge, but the object has none"
+    problem = f"{verb!r} turns a hinge, but the object has none"
     if not isinstance(object, Path):
-        return [f"{says}: choose one that has"]
+        return [f"{problem}: choose one that has"]
     pieces = two_pieces(object)
     if pieces is None:
-        return [f"{says}: it needs a mesh of two objects or nodes, the second of which moves, and --hinge"]
-    named = f" ({pieces[0]!r} and {pieces[1]!r})" if all(pieces) else ""
-    add = '--hinge "px,py,pz dx,dy,dz", a point and the direction of the axis about which the second turns'
-    return [f"{says}: the mesh has two pieces{named}; add {add}"]
+        return [f"{problem}: it needs a mesh of two objects or nodes, the second of which moves, and --hinge"]
+    names = f" ({pieces[0]!r} and {pieces[1]!r})" if all(pieces) else ""
+    option = '--hinge "px,py,pz dx,dy,dz", a point and the direction of the axis about which the second turns'
+    return [f"{problem}: the mesh has two pieces{names}; add {option}"]
 
 
-def _wording(asked: Asked) -> Wording:
-    """What the sentence means to the models that may answer it. Raises BadInput for what they would have to guess."""
-    if asked.models:
-        known, encoder = _vocabulary(asked.models.checkpoints), asked.models.encoder
-        return understood_words(asked.text, known, lambda: encoder, _names(asked), asked.force)
-    known = reduce(add, (_vocabulary(paths.checkpoints) for paths in trained_runs(asked)))
-    return understood_words(asked.text, known, lambda: _settings(asked.profile)[0], _names(asked), asked.force)
+def _wording(request: GenerationRequest) -> Wording:
+    """The sentence in words of the training vocabulary. Raises BadInput for unknown words."""
+    if request.models:
+        vocabulary, encoder = _vocabulary(request.models.checkpoints), request.models.encoder
+        return understood_words(request.text, vocabulary, lambda: encoder, _names(request), request.force)
+    vocabulary = reduce(add, (_vocabulary(paths.checkpoints) for paths in trained_runs(request)))
+    return understood_words(
+        request.text, vocabulary, lambda: _profile_settings(request.profile)[0], _names(request), request.force
+    )
 
 
-def _names(asked: Asked) -> tuple[str]:
-    """What the object is called: words of a sentence that need not be English."""
-    return (asked.object.stem if isinstance(asked.object, Path) else asked.object,)
+def _names(request: GenerationRequest) -> tuple[str]:
+    """The object's name, whose words a sentence may contain although they are not English."""
+    return (request.object.stem if isinstance(request.object, Path) else request.object,)
 
 
-def _not_made(text: str, read_as: tuple[str, float] | None, verb: str | None, known: Vocabulary) -> list[str]:
-    """Which actions of a sentence are not made, since a motion is one; for a person."""
-    made = read_as[0] if read_as else verb
-    further = further_verbs(text, made, known)
-    if made is None or not further:
+def _further_verb_notes(
+    text: str, read_as: tuple[str, float] | None, verb: str | None, vocabulary: Vocabulary
+) -> list[str]:
+    """A note that names the verbs of the sentence which the motion does not show: a motion has one verb."""
+    generated_verb = read_as[0] if read_as else verb
+    further = further_verbs(text, generated_verb, vocabulary)
+    if generated_verb is None or not further:
         return []
-    return [f"a motion is one action: of {made!r}, not of {', '.join(map(repr, further))}; ask for each alone"]
+    others = ", ".join(map(repr, further))
+    return [f"a motion shows one action: this one shows {generated_verb!r}, not {others}; generate each alone"]
 
 
-def _taken_for(verb: str | None, evidence: Mapping[str, Any]) -> list[str]:
-    """That the motion is of another verb than the sentence has; for a person."""
+def _classified_verb_notes(verb: str | None, evidence: Mapping[str, Any]) -> list[str]:
+    """A note if the verb classifier reads another verb than the sentence has."""
     read_as = evidence["read_as"]
-    return [f"the sentence is taken for {read_as[0]!r} ({read_as[1]:.0%})"] if read_as and read_as[0] != verb else []
+    if not read_as or read_as[0] == verb:
+        return []
+    return [f"the sentence is classified as {read_as[0]!r} ({read_as[1]:.0%})"]
 
 
-def _faults(motions: Sequence[GeneratedMotion]) -> list[str]:
-    """What a person would see to be wrong with samples."""
-    each = (motion.evidence for motion in motions)
-    return [f"sample {evidence['number'] + 1}: {fault}" for evidence in each for fault in evidence["faults"]]
+def _fault_notes(motions: Sequence[GeneratedMotion]) -> list[str]:
+    """A note per visible fault of a sample."""
+    samples = (motion.evidence for motion in motions)
+    return [f"sample {evidence['number'] + 1}: {fault}" for evidence in samples for fault in evidence["faults"]]
 
 
-def _of_project(asked: Asked, verb: str | None, thing: str | None) -> tuple[Models, str]:
-    """The models of the project that know the words best, and why these, in words."""
-    paths, why = chosen_model(asked, verb, thing)
-    encoder, points, sampling = _settings(paths.profile)
+def _project_models(request: GenerationRequest, verb: str | None, noun: str | None) -> tuple[Models, str]:
+    """The models of the project that fit the sentence best, and the reason in words."""
+    paths, reason = chosen_model(request, verb, noun)
+    encoder, points, sampling = _profile_settings(paths.profile)
     hands = load_hands(paths.profile)
-    return Models(paths.checkpoints, hands, encoder, _clips_with(asked, paths), sampling, points), why
+    clips = _clips_with(request, paths)
+    models = Models(paths.checkpoints, hands, encoder, clips=clips, sampling=sampling, points=points)
+    return models, reason
 
 
-def _settings(profile: str) -> tuple[TextEncoder, int, SamplingConfig]:
-    """Encoder, points on an object, and sampling of a profile, as params.yaml has them."""
+def _profile_settings(profile: str) -> tuple[TextEncoder, int, SamplingConfig]:
+    """Text encoder, number of object points, and sampling settings of a profile in params.yaml."""
     params = chosen_params({**read_file(Path("params.yaml")), "profile": profile})
     encoder = build_config(AnnotationSettings, params.get("annotate"), "params.yaml: annotate").encoder
     points = build_config(ContactSettings, params.get("contact"), "params.yaml: contact").points
-    told = (params.get("sample") or {}).get("text2hoi")
-    sampling = build_config(SamplingConfig, told, "params.yaml: sample.text2hoi")
-    # Half precision is for GPUs, and this runs on the CPU.
+    section = (params.get("sample") or {}).get("text2hoi")
+    sampling = build_config(SamplingConfig, section, "params.yaml: sample.text2hoi")
+    # Half precision is slow on the CPU, where this runs.
     return load_encoder(encoder), points, replace(sampling, precision="float32")
 
 
-def _clips_with(asked: Asked, paths: StagePaths) -> Path:
-    """The clips among whose objects the one asked for by name is: of the models' own dataset, else of another."""
-    runs = [paths, *(StagePaths(paths.profile, name) for name in asked.datasets)]
-    return next((run.clips for run in runs if _has_object(run, asked.object)), paths.clips)
+def _clips_with(request: GenerationRequest, paths: StagePaths) -> Path:
+    """The first store of clips that has the requested object: of the models' dataset, else of another one."""
+    runs = [paths, *(StagePaths(paths.profile, name) for name in request.datasets)]
+    return next((run.clips for run in runs if _has_object(run, request.object)), paths.clips)
 
 
 def _stored_object(name: str, models: Models) -> ObjectModel:
     if models.clips is not None:
         return stored_object(name, models.clips, models.hands)
     expected = "a mesh file (.obj, .ply, .stl, .glb)"
-    raise BadInput("--object", expected, name, "correct the path; objects by name are known in a project alone")
+    raise BadInput("--object", expected, name, "correct the path; a dataset's objects are available only in a project")
 
 
-def trained_runs(asked: Asked) -> list[StagePaths]:
-    """The datasets that may answer, those with models. Raises MissingResource where there is none."""
-    names = (asked.model,) if asked.model else asked.datasets
-    runs = [StagePaths(asked.profile, name) for name in names]
+def trained_runs(request: GenerationRequest) -> list[StagePaths]:
+    """The requested datasets that have models. Raises MissingResource if none has."""
+    names = (request.model,) if request.model else request.datasets
+    runs = [StagePaths(request.profile, name) for name in names]
     reasons = {paths: why_not_trained(paths) for paths in runs}
     trained = [paths for paths in runs if not reasons[paths]]
     if not trained:
         reason = "; ".join(f"{paths}: {reasons[paths]}" for paths in runs)
-        others = [name for name in asked.datasets if not why_not_trained(StagePaths(asked.profile, name))]
-        instead = f"; models are there of {', '.join(others)}" if others else ""
-        raise MissingResource(f"no models that can generate: {reason}{instead}")
+        others = [name for name in request.datasets if not why_not_trained(StagePaths(request.profile, name))]
+        alternative = f"; these datasets have models: {', '.join(others)}" if others else ""
+        raise MissingResource(f"no models that can generate: {reason}{alternative}")
     return trained
 
 
-def chosen_model(asked: Asked, verb: str | None, thing: str | None) -> tuple[StagePaths, str]:
-    """The dataset whose models to use, and why, in words. Raises MissingResource where none is trained.
+def chosen_model(request: GenerationRequest, verb: str | None, noun: str | None) -> tuple[StagePaths, str]:
+    """The dataset whose models to use, and the reason in words. Raises MissingResource if none is trained.
 
-    One that was trained on the verb goes before all others; then the one that has an object asked for by name, then the
-    one that knows the sentence's object, then the one with more clips of the verb.
+    Datasets are ranked by four criteria, in this order: the verb is in their vocabulary; they have the requested
+    object; the noun is in their vocabulary; the number of clips with the verb.
     """
-    trained = trained_runs(asked)
-    if asked.model:
-        return trained[0], f"models: {trained[0]}, as asked for"
-    known = {paths: _vocabulary(paths.checkpoints) for paths in trained}
+    trained = trained_runs(request)
+    if request.model:
+        return trained[0], f"models: {trained[0]}, as requested"
+    vocabularies = {paths: _vocabulary(paths.checkpoints) for paths in trained}
 
-    def fits(paths: StagePaths) -> tuple[bool, bool, int, int]:
-        own = known[paths]
-        return verb in own.verbs, _has_object(paths, asked.object), own.knows(verb, thing), own.verbs[verb or ""]
+    def rank_key(paths: StagePaths) -> tuple[bool, bool, int, int]:
+        words = vocabularies[paths]
+        has_object = _has_object(paths, request.object)
+        return verb in words.verbs, has_object, words.knows(verb, noun), words.verbs[verb or ""]
 
-    best = max(trained, key=fits)
-    clips = known[best].verbs[verb] if verb else 0
-    why = f", trained on {clips} clips of {verb!r}" if clips else ""
-    return best, f"models: {best}{why} (--model chooses another)"
+    best = max(trained, key=rank_key)
+    n_clips = vocabularies[best].verbs[verb] if verb else 0
+    reason = f", trained on {n_clips} clips of {verb!r}" if n_clips else ""
+    return best, f"models: {best}{reason} (--model chooses another)"
 
 
 def _vocabulary(checkpoints: Path) -> Vocabulary:
@@ -222,14 +226,14 @@ def _vocabulary(checkpoints: Path) -> Vocabulary:
 
 
 def _has_object(paths: StagePaths, name: str | Path) -> bool:
-    """Whether the dataset has the object that was asked for by name; a mesh file is nobody's."""
+    """Whether the dataset has an object of this name; False for the path of a mesh file."""
     if not isinstance(name, str) or not paths.clips.is_dir() or empty_reason(paths.clips):
         return False
     return name in list(open_store(paths.clips, load_hands(paths.profile)).objects["object"])
 
 
 def why_not_trained(paths: StagePaths) -> str | None:
-    """What is missing of the four models of a dataset, or None when all are there."""
+    """The first of the four networks of a dataset that is missing, in words; None if all are present."""
     for name in NAMES:
         folder = paths.checkpoints / name
         if reason := empty_reason(folder):

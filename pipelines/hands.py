@@ -1,7 +1,7 @@
-"""Hands for a motion of an object that a person made up, or that a clip or a generated motion has, as files."""
+"""`hoidata hands`: hand motions for an object motion from keyframes, a clip or a generated motion (BimArt)."""
 
 from dataclasses import dataclass, field, replace
-from os.path import isfile  # of a name that is too long it says no, where a Path raises
+from os.path import isfile  # returns False for a name that is too long, where Path.is_file raises
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +16,6 @@ from hoidata.errors import BadInput
 from hoidata.files import sha256_file
 from hoidata.files.numpy_files import load_npz_arrays
 from hoidata.geometry.rotations import rotvec_to_rotmat
-from hoidata.hands import HandPair
 from hoidata.object_paths import keyframed_path, read_keyframes
 from hoidata.object_paths.path import MAX_S, PathStep, check_pace
 from hoidata.objects.model import Hinge, ObjectModel
@@ -29,8 +28,9 @@ from models.common.checkpoints import FILE_NAME, read_info
 from models.common.family import Sources
 from models.common.repeatable import make_repeatable
 from pipelines.command_inputs import (
-    MeshWish,
-    Written,
+    MeshOptions,
+    ProjectData,
+    WrittenFiles,
     check_dataset,
     mesh_notes,
     nearest_name,
@@ -42,249 +42,253 @@ from pipelines.pages.motion_files import hand_shapes
 from pipelines.showing import find_clip
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
 
-LEAST_S = 0.3
-MOST_FRAMES = round(MAX_S * FPS) + 1
-CLIPS_FOR_RANGE = 60  # of an object, whose hinge angles say how far it opens
-GENERATED = ("object_rotvec", "object_translation_m", "object_vertices_m", "object_faces", "object_part")
+MIN_LENGTH_S = 0.3
+MAX_FRAMES = round(MAX_S * FPS) + 1
+MAX_CLIPS_FOR_RANGE = 60  # recorded clips of an object from which its range of hinge angles is read
+GENERATED_ARRAYS = ("object_rotvec", "object_translation_m", "object_vertices_m", "object_faces", "object_part")
 
 
 @dataclass(frozen=True)
-class HandsWish:
-    """What ``hoidata hands`` is told; "" for what is not.
+class HandsOptions:
+    """The options of ``hoidata hands``. Exactly one of ``keyframes``, ``clip`` and ``motion`` is set."""
 
-    object: a mesh file, or the name of a dataset's object. keyframes: a file; clip: a stored clip's id; motion: a
-    motion.npz of ``hoidata generate``. One of these three. hinge_range: "0:110",
-    degrees. length_s: how long the motion is to last instead of its own time. model: the dataset whose networks to use.
-    """
-
-    object: str = ""
-    keyframes: str = ""
-    clip: str = ""
-    motion: str = ""
-    mesh: MeshWish = field(default_factory=MeshWish)
-    hinge_range: str = ""
+    object: str = ""  # a mesh file, or the name of an object of a dataset
+    keyframes: str = ""  # a CSV or JSON file
+    clip: str = ""  # the id of a stored clip
+    motion: str = ""  # a motion.npz of ``hoidata generate``
+    mesh: MeshOptions = field(default_factory=MeshOptions)
+    hinge_range: str = ""  # degrees, such as "0:110"
     hand: HandType = "both"
     samples: int = 1
     seed: int = 0
-    length_s: float | None = None
-    model: str = ""
+    length_s: float | None = None  # None keeps the source's duration
+    model: str = ""  # the dataset whose networks to use; "" for the first that has them
 
 
-class Asked(NamedTuple):
-    """thing: the motion. steps: what happens when, of a path. source: where it is from, in words."""
+class ObjectMotion(NamedTuple):
+    """An object motion for which to generate hands."""
 
-    thing: ObjectTrack
+    track: ObjectTrack
     wish: MotionWish
-    steps: tuple[PathStep, ...]
-    source: str
+    steps: tuple[PathStep, ...]  # of a path from keyframes
+    source: str  # in words
     notes: list[str]
 
 
-def hands_files(wish: HandsWish, profile: str, datasets: tuple[str, ...], out: Path) -> Written:
-    """Make hands, and write arrays, an animated GLB each and a page that plays them into ``out``.
+def hands_files(options: HandsOptions, profile: str, datasets: tuple[str, ...], out: Path) -> WrittenFiles:
+    """Generate hands; write arrays, an animated GLB per sample and a page with a player into ``out``.
 
-    Raises MissingResource or BadInput that says what is not there or cannot be meant, and what to do.
+    Raises:
+        MissingResource: networks or files are missing.
+        BadInput: the object, its motion or an option is not usable.
     """
     make_repeatable(threads=1)
-    hands = load_hands(profile)
-    asked = asked_motion(wish, profile, datasets, hands)
-    paths, sampler = chosen_networks(wish.model, profile, datasets, hands)
-    motions = hands_for(sampler, asked.thing, asked.wish)
-    used = [paths.checkpoints / name / FILE_NAME for name in BIMART.uses]
-    made_from = {str(path): sha256_file(path) for path in used}
-    learned = trained_on(read_info(paths.checkpoints / BIMART.uses[-1] / FILE_NAME)["facts"])
-    facts = [("object's motion", asked.source), ("networks", f"{paths.checkpoints} (learnt from {learned})")]
-    notes = [*asked.notes, *_notes(motions)]
-    return Written(write_hands(out, motions, hands, asked.steps, made_from, facts, notes), notes)
+    project = ProjectData(profile, datasets, load_hands(profile))
+    motion = object_motion(options, project)
+    paths, sampler = chosen_networks(options.model, project)
+    samples = hands_for(sampler, motion.track, motion.wish)
+    files = [paths.checkpoints / name / FILE_NAME for name in BIMART.uses]
+    digests = {str(path): sha256_file(path) for path in files}
+    training_data = trained_on(read_info(paths.checkpoints / BIMART.uses[-1] / FILE_NAME)["facts"])
+    facts = [("object's motion", motion.source), ("networks", f"{paths.checkpoints} (trained on {training_data})")]
+    notes = [*motion.notes, *_notes(samples)]
+    return WrittenFiles(write_hands(out, samples, project.hands, motion.steps, digests, facts, notes), notes)
 
 
-def asked_motion(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair) -> Asked:
-    """The motion of the object that hands are asked for."""
-    check_dataset(wish.model, profile, datasets)
-    given = {name: value for name in ("keyframes", "clip", "motion") if (value := getattr(wish, name))}
-    if len(given) != 1:
-        got = " and ".join(f"--{name}" for name in given) or "none"
+def object_motion(options: HandsOptions, project: ProjectData) -> ObjectMotion:
+    """The object motion that the options select. Raises BadInput if they select none, or one that is too long."""
+    check_dataset(options.model, project)
+    sources = [name for name in ("keyframes", "clip", "motion") if getattr(options, name)]
+    if len(sources) != 1:
+        got = " and ".join(f"--{name}" for name in sources) or "none"
         raise BadInput("object's motion", "one of --keyframes, --clip or --motion", got, "give one of them")
-    own = MotionWish(wish.seed, wish.samples, wish.hand)
-    if wish.clip:
-        asked = _of_clip(wish, profile, datasets, hands, own)
-    elif wish.motion:
-        asked = _of_generated(wish, profile, datasets, hands, own)
+    wish = MotionWish(options.seed, options.samples, options.hand)
+    if options.clip:
+        motion = _clip_motion(options, project, wish)
+    elif options.motion:
+        motion = _generated_motion(options, project, wish)
     else:
-        asked = _of_path(wish, profile, datasets, hands, own)
-    if wish.length_s is not None:
-        asked = _lasting(asked, wish.length_s)
-    if asked.thing.n_frames > MOST_FRAMES:
-        got = f"{(asked.thing.n_frames - 1) / FPS:g} s"
-        raise BadInput("object's motion", f"at most {MAX_S:g} s", got, "make two of it, or tell a --length")
-    if wish.hinge_range and not asked.thing.model.is_articulated:
-        note = "the object is rigid, so --hinge-range is not looked at; --hinge tells where it turns"
-        asked = asked._replace(notes=[*asked.notes, note])
-    return asked
+        motion = _keyframed_motion(options, project, wish)
+    if options.length_s is not None:
+        motion = _retimed(motion, options.length_s)
+    if motion.track.n_frames > MAX_FRAMES:
+        got = f"{(motion.track.n_frames - 1) / FPS:g} s"
+        raise BadInput("object's motion", f"at most {MAX_S:g} s", got, "split it in two, or set a --length")
+    if options.hinge_range and not motion.track.model.is_articulated:
+        note = "the object is rigid, so --hinge-range has no effect; --hinge sets the axis of a hinge"
+        motion = motion._replace(notes=[*motion.notes, note])
+    return motion
 
 
-def chosen_networks(
-    model: str, profile: str, datasets: tuple[str, ...], hands: HandPair
-) -> tuple[StagePaths, HandsForPaths]:
-    """The networks of the dataset asked for, or of the first that has them. Raises MissingResource where none has."""
-    paths, _ = trained_run("bimart", BIMART.uses, model, profile, datasets, hands)
-    sources = Sources(load_annotated(paths.data, hands), paths.checkpoints, hands, torch.device("cpu"))
+def chosen_networks(model: str, project: ProjectData) -> tuple[StagePaths, HandsForPaths]:
+    """The networks of the requested dataset, or of the first that has them. Raises MissingResource if none has."""
+    paths, _ = trained_run("bimart", BIMART.uses, model, project)
+    annotated = load_annotated(paths.data, project.hands)
+    sources = Sources(annotated, paths.checkpoints, project.hands, torch.device("cpu"))
     return paths, HandsForPaths.load(sources)
 
 
-def _notes(motions: list[MadeHands]) -> list[str]:
-    """What a person should know of the motions: an open or repaired mesh, a hand that never touches."""
-    notes = mesh_notes(motions[0].clip.object.model)
-    for motion in motions:
-        idle = [side for side, touching in motion.standing.touching.items() if not touching.any()]
+def _notes(samples: list[MadeHands]) -> list[str]:
+    """Notes on the mesh (open, repaired), and on hands that never touch the object."""
+    notes = mesh_notes(samples[0].clip.object.model)
+    for sample in samples:
+        idle = [side for side, touching in sample.standing.touching.items() if not touching.any()]
         if idle:
-            notes.append(f"sample {motion.number + 1}: the {' and the '.join(idle)} hand touches nothing")
+            notes.append(f"sample {sample.number + 1}: the {' and the '.join(idle)} hand touches nothing")
     return notes
 
 
-class _Thing(NamedTuple):
-    """An object to be moved. limits_rad: the stops of its hinge. standing: see ``checked_path``. notes: what was
-    assumed."""
+class _MovableObject(NamedTuple):
+    """An object that keyframes move."""
 
     model: ObjectModel
-    limits_rad: tuple[float, float] | None
-    standing: np.ndarray | None
+    hinge_limits_rad: tuple[float, float] | None  # lowest and highest angle
+    rest_rotation: np.ndarray | None  # (3, 3) world_from_object as it stands on the table; None: as its mesh is stored
     notes: list[str]
 
 
-def _object(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair) -> _Thing:
-    if not wish.object:
+def _object(options: HandsOptions, project: ProjectData) -> _MovableObject:
+    if not options.object:
         raise BadInput("object", "a mesh file (.obj, .ply, .stl, .glb) or a dataset's object", "none", "name it first")
-    limits = hinge_range(wish.hinge_range) if wish.hinge_range else None
-    if isfile(wish.object):
-        user = read_user_object(Path(wish.object), wish.mesh.unit, wish.mesh.up, wish.mesh.hinge)
+    limits_rad = hinge_range(options.hinge_range) if options.hinge_range else None
+    if isfile(options.object):
+        mesh = options.mesh
+        user = read_user_object(Path(options.object), mesh.unit, mesh.up, mesh.hinge)
         notes = list(user.notes)
-        if user.model.is_articulated and limits is None:
-            notes.append("how far the hinge opens is not known; --hinge-range 0:110 has it checked")
-        return _Thing(user.model, limits, None, notes)
-    stores = _converted((wish.model,) if wish.model else datasets, profile, hands)
+        if user.model.is_articulated and limits_rad is None:
+            notes.append("the range of the hinge is not known; --hinge-range 0:110 has it checked")
+        return _MovableObject(user.model, limits_rad, None, notes)
+    stores = _converted((options.model,) if options.model else project.datasets, project)
     for store in stores:
-        if wish.object in list(store.objects["object"]):
-            return _recorded(store, wish.object, limits)
+        if options.object in list(store.objects["object"]):
+            return _recorded_object(store, options.object, limits_rad)
     names = sorted({name for store in stores for name in store.objects["object"]})
     expected = "a mesh file (.obj, .ply, .stl, .glb)" + (f" or one of: {', '.join(names)}" if names else "")
-    remedy = nearest_name(wish.object, names) or ("correct the name or path" if names else "correct the path")
-    raise BadInput("object", expected, wish.object, remedy)
+    remedy = nearest_name(options.object, names) or ("correct the name or path" if names else "correct the path")
+    raise BadInput("object", expected, options.object, remedy)
 
 
-def _converted(names: tuple[str, ...], profile: str, hands: HandPair) -> list[Store]:
-    """The stores of the datasets that are converted."""
-    folders = [StagePaths(profile, name).clips for name in names]
-    return [open_store(own, hands) for own in folders if not empty_reason(own) and (own / "meta").is_dir()]
+def _converted(names: tuple[str, ...], project: ProjectData) -> list[Store]:
+    """The stores of those datasets that are converted."""
+    folders = [StagePaths(project.profile, name).clips for name in names]
+    converted = [folder for folder in folders if not empty_reason(folder) and (folder / "meta").is_dir()]
+    return [open_store(folder, project.hands) for folder in converted]
 
 
-def _recorded(store: Store, name: str, limits: tuple[float, float] | None) -> _Thing:
-    """An object of a dataset: it stands as in the first frame of its first clip, and opens to the side it did there."""
-    rows = [clip_id for clip_id, own in zip(store.ids, store.sequences["object"], strict=True) if own == name]
-    clips, notes = [store.clip(clip_id) for clip_id in rows[:CLIPS_FOR_RANGE]], list[str]()
+def _recorded_object(store: Store, name: str, limits_rad: tuple[float, float] | None) -> _MovableObject:
+    """An object of a dataset, at rest as in the first frame of its first clip, with the recorded range of its hinge."""
+    objects = zip(store.ids, store.sequences["object"], strict=True)
+    clip_ids = [clip_id for clip_id, object_name in objects if object_name == name]
+    clips, notes = [store.clip(clip_id) for clip_id in clip_ids[:MAX_CLIPS_FOR_RANGE]], list[str]()
     first = clips[0]
-    standing = upright(first.gravity) @ rotvec_to_rotmat(first.object.rotvec[0].astype(np.float64))
+    rest_rotation = upright(first.gravity) @ rotvec_to_rotmat(first.object.rotvec[0].astype(np.float64))
     angles = [clip.object.hinge_rad for clip in clips if clip.object.hinge_rad is not None]
-    if angles and limits is None:
+    if angles and limits_rad is None:
         low, high = min(0.0, *(float(a.min()) for a in angles)), max(0.0, *(float(a.max()) for a in angles))
         notes.append(f"recorded with its hinge at {np.degrees(low):.0f} to {np.degrees(high):.0f} deg")
-        # Recordings say to which side it opens, not how far it could.
-        limits = (-np.pi, high) if -low > high else (low, np.pi)
-    return _Thing(store.object_model(name), limits, standing, notes)
+        # Recordings show the direction in which a hinge opens, but not its stop, so half a turn is allowed.
+        limits_rad = (-np.pi, high) if -low > high else (low, np.pi)
+    return _MovableObject(store.object_model(name), limits_rad, rest_rotation, notes)
 
 
 def hinge_range(text: str) -> tuple[float, float]:
-    """ "0:110", degrees, as radians."""
+    """The lowest and highest hinge angle, radians, of a text in degrees such as "0:110"."""
     try:
-        low, high = (float(word) for word in text.split(":"))
-        if not -360 <= low <= 0 <= high <= 360 or low == high:
+        low_deg, high_deg = (float(word) for word in text.split(":"))
+        if not -360 <= low_deg <= 0 <= high_deg <= 360 or low_deg == high_deg:
             raise ValueError
     except ValueError as error:
-        remedy = "write e.g. 0:110; 0 is the hinge as the mesh is drawn"
-        raise BadInput("--hinge-range", "two angles in degrees, with 0 among them", text[:40], remedy) from error
-    return float(np.radians(low)), float(np.radians(high))
+        remedy = "write e.g. 0:110; 0 is the hinge angle of the mesh as stored"
+        raise BadInput("--hinge-range", "two angles in degrees that include 0", text[:40], remedy) from error
+    return float(np.radians(low_deg)), float(np.radians(high_deg))
 
 
-def _of_path(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair, own: MotionWish) -> Asked:
-    thing = _object(wish, profile, datasets, hands)
-    keys = read_keyframes(wish.keyframes)
-    path = keyframed_path(thing.model, keys, thing.limits_rad, wish.keyframes, thing.standing)
-    return Asked(path.track, own, path.steps, f"keyframes of {Path(wish.keyframes).name}", thing.notes)
+def _keyframed_motion(options: HandsOptions, project: ProjectData, wish: MotionWish) -> ObjectMotion:
+    movable = _object(options, project)
+    keys = read_keyframes(options.keyframes)
+    path = keyframed_path(movable.model, keys, movable.hinge_limits_rad, options.keyframes, movable.rest_rotation)
+    source = f"keyframes of {Path(options.keyframes).name}"
+    return ObjectMotion(path.track, wish, steps=path.steps, source=source, notes=movable.notes)
 
 
-def _of_clip(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair, own: MotionWish) -> Asked:
-    """A stored clip's object motion, for the hands of its person."""
-    if wish.object:
-        raise BadInput("object", "none beside --clip, which has its own", wish.object, "leave it out")
-    paths = find_clip(wish.clip, profile, list(datasets))
-    clip = open_store(paths.clips, hands).clip(wish.clip)
+def _clip_motion(options: HandsOptions, project: ProjectData, wish: MotionWish) -> ObjectMotion:
+    """The object motion of a stored clip, with the hand shapes of its subject."""
+    if options.object:
+        raise BadInput("object", "no object with --clip, which has one", options.object, "omit it")
+    paths = find_clip(options.clip, project.profile, list(project.datasets))
+    clip = open_store(paths.clips, project.hands).clip(options.clip)
     betas, template_m = hand_shapes(clip)
     notes = [] if clip.gravity is not None else ["up: z, assumed: the gravity of this clip is not known"]
-    gravity = own.gravity if clip.gravity is None else np.asarray(clip.gravity, np.float64)
-    own = replace(own, words=clip.object_words, gravity=gravity, betas=betas, template_m=template_m)
-    return Asked(clip.object, own, (), f"clip {wish.clip}", notes)
+    gravity = wish.gravity if clip.gravity is None else np.asarray(clip.gravity, np.float64)
+    wish = replace(wish, words=clip.object_words, gravity=gravity, betas=betas, template_m=template_m)
+    return ObjectMotion(clip.object, wish, steps=(), source=f"clip {options.clip}", notes=notes)
 
 
-def _of_generated(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair, own: MotionWish) -> Asked:
-    """The object's motion of a motion.npz that ``hoidata generate`` wrote, with the mesh in it or the one told."""
-    path = Path(wish.motion)
+def _generated_motion(options: HandsOptions, project: ProjectData, wish: MotionWish) -> ObjectMotion:
+    """The object motion in a motion.npz of ``hoidata generate``, with its mesh or with the object of the options."""
+    path = Path(options.motion)
     if not path.is_file():
-        raise BadInput(path, "a motion.npz of `hoidata generate`", "nothing there", "correct the path")
+        raise BadInput(path, "a motion.npz of `hoidata generate`", "no such file", "correct the path")
     arrays = load_npz_arrays(path)
-    missing = [name for name in GENERATED if name not in arrays]
+    missing = [name for name in GENERATED_ARRAYS if name not in arrays]
     if missing:
         raise BadInput(path, "a motion.npz of `hoidata generate`", f"no {missing[0]}", "give one, or --keyframes")
-    if wish.object:
-        model, _, _, notes = _object(wish, profile, datasets, hands)
+    if options.object:
+        model, _, _, notes = _object(options, project)
     else:
         model, notes = _mesh_of(arrays, path), []
-    angle = arrays.get("object_hinge_rad")
-    if model.is_articulated != (angle is not None):
+    hinge_rad = arrays.get("object_hinge_rad")
+    if model.is_articulated != (hinge_rad is not None):
         remedy = "give the same object as `hoidata generate` had, with its hinge"
-        raise BadInput(path, "an object with a hinge where the motion has one", model.name, remedy)
-    thing = ObjectTrack(model, arrays["object_rotvec"], arrays["object_translation_m"], angle)
-    _check_track(thing, path)
+        raise BadInput(path, "an object with a hinge if the motion has one", model.name, remedy)
+    track = ObjectTrack(model, arrays["object_rotvec"], arrays["object_translation_m"], hinge_rad)
+    _check_track(track, path)
     gravity = arrays.get("gravity", np.zeros(0))
-    own = replace(own, gravity=np.asarray(gravity, np.float64) if gravity.shape == (3,) else own.gravity)
-    return Asked(thing, own, (), f"generated for {str(arrays.get('text', path.name))!r}", notes)
+    wish = replace(wish, gravity=np.asarray(gravity, np.float64) if gravity.shape == (3,) else wish.gravity)
+    source = f"generated for {str(arrays.get('text', path.name))!r}"
+    return ObjectMotion(track, wish, steps=(), source=source, notes=notes)
 
 
 def _mesh_of(arrays: dict[str, np.ndarray], path: Path) -> ObjectModel:
     hinge = None
     if "object_hinge_rad" in arrays:
         if "object_hinge_axis" not in arrays:
-            raise BadInput(path, "an object_hinge_axis", "none", "name the object too, or generate the motion anew")
+            raise BadInput(path, "an object_hinge_axis", "none", "name the object too, or generate the motion again")
         hinge = Hinge(arrays["object_hinge_axis"], arrays["object_hinge_origin_m"])
     vertices, faces, part = (arrays[f"object_{name}"] for name in ("vertices_m", "faces", "part"))
     fits = vertices.shape == (len(part), 3) and faces.ndim == 2 and faces.shape[1] == 3 and faces.dtype.kind in "iu"
     if not fits or not len(faces) or not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
-        raise BadInput(path, "a mesh", f"{vertices.shape}, {faces.shape}", "generate the motion anew")
-    return ObjectModel("object", vertices.astype(np.float64), faces.astype(np.int64), part, hinge)
+        raise BadInput(path, "a mesh", f"{vertices.shape}, {faces.shape}", "generate the motion again")
+    return ObjectModel(
+        "object", vertices_m=vertices.astype(np.float64), faces=faces.astype(np.int64), part=part, hinge=hinge
+    )
 
 
-def _check_track(thing: ObjectTrack, path: Path) -> None:
-    count = len(thing.translation_m)
-    arrays = [thing.rotvec, thing.translation_m] + ([] if thing.hinge_rad is None else [thing.hinge_rad])
-    shapes = [(count, 3), (count, 3), (count,)][: len(arrays)]
-    if [a.shape for a in arrays] != shapes or not all(a.dtype.kind == "f" and np.isfinite(a).all() for a in arrays):
-        raise BadInput(path, "finite poses of every frame", f"{[a.shape for a in arrays]}", "generate the motion anew")
+def _check_track(track: ObjectTrack, path: Path) -> None:
+    count = len(track.translation_m)
+    arrays = [track.rotvec, track.translation_m] + ([] if track.hinge_rad is None else [track.hinge_rad])
+    expected = [(count, 3), (count, 3), (count,)][: len(arrays)]
+    shapes = [array.shape for array in arrays]
+    if shapes != expected or not all(array.dtype.kind == "f" and np.isfinite(array).all() for array in arrays):
+        raise BadInput(path, "finite poses of all frames", f"{shapes}", "generate the motion again")
 
 
-def _lasting(asked: Asked, seconds: float) -> Asked:
-    """The same way in another time. Raises BadInput for a time that is none, or too short for it."""
-    thing = asked.thing
-    if not LEAST_S <= seconds <= MAX_S:
-        raise BadInput("--length", f"{LEAST_S:g} to {MAX_S:g} s", f"{seconds:g} s", "ask for another length")
-    if thing.n_frames < 2:
-        raise BadInput("--length", "a motion of two frames or more", "one frame", "leave it out")
-    count = round(seconds * FPS) + 1
-    pace = (count - 1) / (thing.n_frames - 1)
-    if pace < 1:
-        check_pace(thing, pace, "--length")
-    old, new = np.arange(thing.n_frames), np.linspace(0, thing.n_frames - 1, count)
-    turned = Slerp(old, Rotation.from_rotvec(thing.rotvec))(new).as_rotvec().astype(np.float32)
-    place = CubicSpline(old, thing.translation_m)(new).astype(np.float32)
-    hinge = None if thing.hinge_rad is None else CubicSpline(old, thing.hinge_rad)(new).astype(np.float32)
-    steps = tuple(PathStep(step.words, step.start_s * pace, step.end_s * pace) for step in asked.steps)
-    slowed = ObjectTrack(thing.model, turned, place, hinge)
-    return asked._replace(thing=slowed, steps=steps, source=f"{asked.source}, in {seconds:g} s")
+def _retimed(motion: ObjectMotion, length_s: float) -> ObjectMotion:
+    """The same trajectory with another duration. Raises BadInput for one out of range, or too short for the motion."""
+    track = motion.track
+    if not MIN_LENGTH_S <= length_s <= MAX_S:
+        expected = f"{MIN_LENGTH_S:g} to {MAX_S:g} s"
+        raise BadInput("--length", expected, f"{length_s:g} s", "set another length")
+    if track.n_frames < 2:
+        raise BadInput("--length", "a motion of two frames or more", "one frame", "omit the option")
+    n_frames = round(length_s * FPS) + 1
+    stretch = (n_frames - 1) / (track.n_frames - 1)
+    if stretch < 1:
+        check_pace(track, stretch, "--length")
+    old, new = np.arange(track.n_frames), np.linspace(0, track.n_frames - 1, n_frames)
+    rotvec = Slerp(old, Rotation.from_rotvec(track.rotvec))(new).as_rotvec().astype(np.float32)
+    translation_m = CubicSpline(old, track.translation_m)(new).astype(np.float32)
+    hinge_rad = None if track.hinge_rad is None else CubicSpline(old, track.hinge_rad)(new).astype(np.float32)
+    steps = tuple(PathStep(step.words, step.start_s * stretch, step.end_s * stretch) for step in motion.steps)
+    retimed = ObjectTrack(track.model, rotvec, translation_m, hinge_rad)
+    return motion._replace(track=retimed, steps=steps, source=f"{motion.source}, in {length_s:g} s")

@@ -1,4 +1,4 @@
-"""params.yaml as the chosen profile has it: ``profiles.<profile>`` laid over the sections of the same names."""
+"""params.yaml with the overlay of the chosen profile: ``profiles.<profile>`` overrides the other sections."""
 
 import re
 from pathlib import Path
@@ -7,11 +7,11 @@ from typing import Any
 from hoidata.errors import BadInput
 from hoidata.settings import Section, as_section, laid_over, refuse_unknown
 
-# embedded and study: made here, two corpora for two ends; own: the user's files.
+# embedded and study are generated corpora; own has the user's files.
 PROFILES = ("embedded", "study", "own")
-MOST_NESTED = 2000
+MAX_NESTING = 2000
 KEYS = "params.yaml: "
-# dvc.yaml itself reads these to write its stages out, from the top of params.yaml alone.
+# Keys that the templates of dvc.yaml use. DVC reads them from the top level, so a profile cannot override them.
 TEMPLATED = (
     *("profile", "profiles", "datasets", "families", "family_datasets", "train.preset", "train.size"),
     *("tables.datasets", "tables.runs"),
@@ -19,65 +19,74 @@ TEMPLATED = (
 
 
 def read_params(root: Path) -> dict[str, Any]:
-    """All sections of the project's params.yaml, as the profile it chooses has them."""
+    """All sections of the project's params.yaml, with the overlay of the chosen profile."""
     return chosen_params(read_file(root / "params.yaml"))
 
 
 def read_file(path: Path) -> dict[str, Any]:
-    """params.yaml as it stands there, overlays apart under ``profiles``. Raises BadInput for what is no such file."""
+    """The content of params.yaml, without applying overlays. Raises BadInput for a malformed file."""
     try:
         values = load_yaml(path.read_bytes())
     except (ValueError, RecursionError, OSError) as error:
         raise BadInput(path, "YAML text", str(error)[:300], "correct it, or restore it with git checkout") from error
     if not isinstance(values, dict):
-        raise BadInput(path, "sections with a name each", type(values).__name__, "restore it with git checkout")
+        raise BadInput(path, "named sections", type(values).__name__, "restore it with git checkout")
     return values
 
 
 def load_yaml(text: bytes) -> Any:
-    """The value of YAML text as DVC reads it: YAML 1.2, in which ``1e-05`` is a number and ``on`` is text.
+    """Parse YAML as DVC does: YAML 1.2, in which ``1e-05`` is a number and ``on`` is text.
 
-    Raises ValueError for anything else, RecursionError where the nesting is too deep: the parser in C would end this
-    process, so such text is given to the one in Python.
+    Raises:
+        ValueError: the text is not YAML.
+        RecursionError: the nesting is too deep. The parser in C would crash on such text, so it goes to the one in
+            Python.
     """
     from ruamel.yaml import YAML, YAMLError
 
-    deep = text.count(b"[") + text.count(b"{") > MOST_NESTED or re.search(rb"[ ?-]{%d}" % MOST_NESTED, text)
+    deep = text.count(b"[") + text.count(b"{") > MAX_NESTING or re.search(rb"[ ?-]{%d}" % MAX_NESTING, text)
     try:
         return YAML(typ="safe", pure=bool(deep)).load(text)
-    except (YAMLError, LookupError, TypeError, AttributeError) as error:  # of a tag that does not fit its text
+    except (
+        YAMLError,
+        LookupError,
+        TypeError,
+        AttributeError,
+    ) as error:  # the last three: a tag that does not fit its value
         raise ValueError(str(error)) from error
 
 
 def chosen_params(values: dict[str, Any]) -> Section:
     """The sections with the chosen profile's overlay: mappings are merged, lists and single values replaced.
 
-    Every entry keeps its full key in the file for error messages. Raises BadInput for a profile or section that is not
-    known, and for what dvc.yaml cannot read from an overlay.
+    All entries keep their full key in the file for error messages. Raises BadInput for an unknown profile or section,
+    and for keys that a profile cannot override.
     """
     sections = {name: value for name, value in values.items() if name != "profiles"}
     overlays = _mapping(values.get("profiles"), "params.yaml: profiles")
     refuse_unknown(overlays, PROFILES, "params.yaml: profiles")
     for profile, overlay in overlays.items():
-        _check(_mapping(overlay, f"params.yaml: profiles.{profile}"), sections, f"params.yaml: profiles.{profile}")
+        _check_overlay(
+            _mapping(overlay, f"params.yaml: profiles.{profile}"), sections, f"params.yaml: profiles.{profile}"
+        )
     chosen = _mapping(overlays.get(str(values.get("profile"))), "params.yaml: profiles")
-    said = {name: value for name, value in chosen.items() if value is not None}
-    return laid_over(as_section(sections, KEYS), as_section(said, f"{KEYS}profiles.{values.get('profile')}."))
+    overlay_values = {name: value for name, value in chosen.items() if value is not None}
+    return laid_over(as_section(sections, KEYS), as_section(overlay_values, f"{KEYS}profiles.{values.get('profile')}."))
 
 
-def _check(overlay: dict[str, Any], sections: dict[str, Any], where: str) -> None:
+def _check_overlay(overlay: dict[str, Any], sections: dict[str, Any], path: str) -> None:
     for key in TEMPLATED:
         section, _, name = key.partition(".")
-        if section in overlay and (not name or name in _mapping(overlay[section], f"{where}.{section}")):
+        if section in overlay and (not name or name in _mapping(overlay[section], f"{path}.{section}")):
             remedy = "set it at the top of params.yaml, for all profiles"
-            raise BadInput(f"{where}.{key}", "settings of a stage", "what dvc.yaml writes its stages from", remedy)
-    refuse_unknown(overlay, [name for name in sections if name not in TEMPLATED], where)
+            raise BadInput(f"{path}.{key}", "settings of a stage", "a key that dvc.yaml uses", remedy)
+    refuse_unknown(overlay, [name for name in sections if name not in TEMPLATED], path)
     for name, value in overlay.items():
         if isinstance(sections[name], dict):
-            _mapping(value, f"{where}.{name}")
+            _mapping(value, f"{path}.{name}")
 
 
-def _mapping(value: Any, where: str) -> dict[str, Any]:
+def _mapping(value: Any, path: str) -> dict[str, Any]:
     if not isinstance(value, dict | None):
-        raise BadInput(where, "keys with values", repr(value)[:80], "correct it")
+        raise BadInput(path, "keys with values", repr(value)[:80], "correct it")
     return value or {}

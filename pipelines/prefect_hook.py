@@ -1,12 +1,11 @@
-"""What Prefect loads at its start in a project's folder (entry point group ``prefect.plugins``, see prefect.toml).
+"""The plugin that Prefect loads in a project's folder (entry point group ``prefect.plugins``, see prefect.toml).
 
-The hook does four things:
+Its effects:
 
-- ``prefect deployment run annotate-arctic`` works as typed. Prefect wants FLOW/DEPLOYMENT and has no setting for less,
-  so its look-up by name is wrapped; the form with a slash always works.
-- It hands over the key to this project's server.
-- A flow run ends with the process that serves the flows, because it would obey whoever listens at the address next.
-- No process loads results that a server points to, because reading them can run code.
+- ``prefect deployment run annotate-arctic`` works without the flow's name, although Prefect requires FLOW/DEPLOYMENT.
+- Prefect gets the key of this project's server.
+- A flow run is killed with the process that serves the flows, since it would obey the next server at the address.
+- No process loads results that a server names, because reading them can run code.
 """
 
 import os
@@ -28,7 +27,7 @@ SERVING = "HOIDATA_PREFECT_SERVING"
 
 @register_hook
 def setup_environment(*, ctx) -> SetupResult | None:
-    """Called once when Prefect is imported; Prefect reads its settings again when variables are returned."""
+    """Prefect calls this once on import, and reads its settings again if variables are returned."""
     end_flow_run_with_its_starter()
     refuse_stored_results()
     accept_bare_names(ctx)
@@ -36,9 +35,9 @@ def setup_environment(*, ctx) -> SetupResult | None:
 
 
 def end_flow_run_with_its_starter() -> None:
-    """The process that serves the flows leaves its id to those of its flow runs, which the kernel then ends with it.
+    """Kill flow runs with the process that serves the flows, which passes its id on in the environment.
 
-    A flow run whose starter ended while Prefect was imported ends now.
+    A flow run whose starter has already ended is killed now.
     """
     if "PREFECT__FLOW_RUN_ID" not in os.environ:
         os.environ[SERVING] = str(os.getpid())
@@ -50,18 +49,18 @@ def end_flow_run_with_its_starter() -> None:
 
 
 def refuse_stored_results() -> None:
-    """Our flows store no results. A state of the server may name any file as one, and pickle as its format."""
+    """Make Prefect refuse stored results: a server could name any file as one, with pickle as its format."""
     from prefect.results import ResultRecord
 
     def refuse(*_: object, **__: object) -> NoReturn:
-        raise BadInput("a state of the Prefect server", "no stored result", "one to be loaded", "start the run again")
+        raise BadInput("a state of the Prefect server", "no stored result", "a result to load", "start the run again")
 
     ResultRecord.deserialize = refuse
     ResultRecord.deserialize_from_result_and_metadata = refuse
 
 
 def key_for(url: str | None) -> SetupResult | None:
-    """The key as Prefect's setting, unless the user set one; a server that is not on this machine never gets it."""
+    """The key as Prefect's setting, unless the user set one. A server on another machine never gets it."""
     if "PREFECT_API_AUTH_STRING" in os.environ or not is_loopback(url):
         return None
     key = read_key()
@@ -69,28 +68,28 @@ def key_for(url: str | None) -> SetupResult | None:
 
 
 def accept_bare_names(ctx) -> None:
-    """Leaves Prefect as it is when its client is not where it used to be."""
+    """Accept deployment names without a flow; only warns if Prefect has moved its client class."""
     try:
         from prefect.client.orchestration._deployments.client import DeploymentAsyncClient
     except ImportError:
-        ctx.logger_factory(__name__).warning("this Prefect wants deployments as FLOW/DEPLOYMENT")
+        ctx.logger_factory(__name__).warning("this version of Prefect requires deployments as FLOW/DEPLOYMENT")
         return
     wrap_lookup(DeploymentAsyncClient)
 
 
 def wrap_lookup(client: type) -> None:
-    """Make ``client.read_deployment_by_name`` accept a name without a slash, where exactly one deployment has it."""
+    """Make ``client.read_deployment_by_name`` accept a name without a slash if exactly one deployment has it."""
     original = client.read_deployment_by_name
 
     async def read_deployment_by_name(self, name: str):
         if "/" in name:
             return await original(self, name)
-        found = await _deployments_named(self, name)
-        names = [] if found else await _all_names(self)
+        matches = await _deployments_named(self, name)
+        names = [] if matches else await _all_names(self)
         try:
-            return only_one(name, found, names)
+            return only_one(name, matches, names)
         except ValueError as error:
-            if Path(sys.argv[0]).name == "prefect":  # whoever types a name wants an answer, not a traceback
+            if Path(sys.argv[0]).name == "prefect":  # on the command line: a message instead of a traceback
                 raise SystemExit(str(error)) from None
             raise
 
@@ -107,14 +106,14 @@ async def _all_names(client) -> list[str]:
     return [deployment.name for deployment in await client.read_deployments()]
 
 
-def only_one(name: str, found: list, names: list[str]):
-    """The one deployment of that name. Raises ValueError, with the nearest of ``names``, when there is not just one."""
-    if len(found) == 1:
-        return found[0]
-    if not found:
-        near = ", ".join(get_close_matches(name, names, 3, 0.5))
-        meant = f"did you mean {near}? " if near else ""
+def only_one(name: str, matches: list, names: list[str]):
+    """The only deployment with that name. Raises ValueError, with similar ``names``, if there are none or several."""
+    if len(matches) == 1:
+        return matches[0]
+    if not matches:
+        similar = ", ".join(get_close_matches(name, names, 3, 0.5))
+        question = f"did you mean {similar}? " if similar else ""
         raise ValueError(
-            f"no deployment is named {name!r}; {meant}`prefect deployment ls` lists them, `hoidata up` makes them"
+            f"no deployment is named {name!r}; {question}`prefect deployment ls` lists them, `hoidata up` creates them"
         )
-    raise ValueError(f"{len(found)} flows have a deployment named {name!r}; write FLOW/{name}")
+    raise ValueError(f"{len(matches)} flows have a deployment named {name!r}; write FLOW/{name}")

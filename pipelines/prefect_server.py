@@ -1,12 +1,12 @@
 """`hoidata up`: a Prefect server for this folder, on the loopback interface, and one process that serves the flows.
 
-Every page open in a browser and every user of the machine reaches that interface. So the server answers nobody without
-the project's key, no other origin, and no change without a CSRF token. Only the health check, the empty shell of its
-pages and Prefect's API reference are open. Whoever has the key can run code as you. It is new at every start, for the
-owner alone, and never appears in an argument, a log or a committed file.
+All pages open in a browser and all users of the machine can reach that interface. So the server requires the project's
+key, refuses other origins, and requires a CSRF token for changes. Only the health check, the empty shell of its pages
+and Prefect's API reference are open. Anyone with the key can run code as you. The key is new at each start, readable by
+the owner only, and never appears in an argument, a log or a committed file.
 
-A run cannot bring a command, an environment or a folder of its own. The process that serves the flows obeys whoever
-answers at the address, so it lives only as long as our server does.
+A run cannot specify a command, an environment or a folder. The process that serves the flows obeys any server at the
+address, so it is killed when our server ends.
 """
 
 import os
@@ -36,7 +36,7 @@ from hoidata.package_paths import python_path
 
 KEY_FILE = Path(".prefect/api-key")
 START_TIMEOUT_S = 180
-STOP_TIMEOUT_S = 4  # less than what Ctrl-C leaves a command
+STOP_TIMEOUT_S = 4  # shorter than the time that Ctrl-C gives a command
 
 
 def serve() -> int:
@@ -52,33 +52,33 @@ def _serve(url: str, environment: dict[str, str]) -> int:
     server, flows = _start_server(url, environment), None
     try:
         wait_until_healthy(url, server)
-        print(f"{_origin(url)} asks for a password: the text in {KEY_FILE}, new at every start", flush=True)
+        print(f"{_origin(url)} requires a password: the text in {KEY_FILE}, new at each start", flush=True)
         flows = _start(_module("pipelines.flows"), environment)
-        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)  # until one of them ends
+        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)  # wait until server or flows end
         return server.poll() or flows.poll() or 1
     except KeyboardInterrupt:
         return 0
     finally:
-        if flows is not None:  # first: without its server it would obey whoever listens at the address next
+        if flows is not None:  # first, since without our server it would obey the next one at the address
             flows.kill()
             flows.wait()
         _stop(server)
 
 
 def stop_running() -> bool:
-    """Stop this folder's `hoidata up`, if there is one, and wait until it has ended; whether there was one."""
+    """Stop this folder's `hoidata up` and wait until it has ended. Returns whether it was running."""
     try:
         with exclusive(KEY_FILE, wait_s=0):
             return False
     except BadInput:
-        with suppress(ProcessLookupError, FileNotFoundError):  # it has just ended by itself
+        with suppress(ProcessLookupError, FileNotFoundError):  # it has just ended
             os.kill(int((KEY_FILE.parent / f".{KEY_FILE.name}.lock").read_text()), signal.SIGTERM)
         with exclusive(KEY_FILE, wait_s=5 * STOP_TIMEOUT_S):
             return True
 
 
 def _stop(process: subprocess.Popen) -> None:
-    """Ask a process to end; one that has not ended after ``STOP_TIMEOUT_S`` is killed."""
+    """Terminate a process; kill it after ``STOP_TIMEOUT_S``."""
     process.terminate()
     try:
         process.wait(STOP_TIMEOUT_S)
@@ -88,7 +88,7 @@ def _stop(process: subprocess.Popen) -> None:
 
 
 def api_url() -> str:
-    """PREFECT_API_URL, else the address in prefect.toml. Raises BadInput unless it is a port of this machine alone."""
+    """PREFECT_API_URL, else the address in prefect.toml. Raises BadInput if it is not a loopback address with port."""
     configured = str(tomllib.loads(Path("prefect.toml").read_text())["api"]["url"])
     url = (os.environ.get("PREFECT_API_URL") or configured).rstrip("/")
     if not is_loopback(url) or url != f"{_origin(url)}/api":
@@ -98,14 +98,14 @@ def api_url() -> str:
 
 
 def _origin(url: str) -> str:
-    """What a browser calls the server at ``url``: scheme, host and port."""
+    """The origin of ``url`` as browsers send it: scheme, host and port."""
     return f"http://{urlsplit(url).netloc}"
 
 
 def server_environment(url: str, key: str) -> dict[str, str]:
-    """What the two processes run with: only who has the key is let in, nothing is reported home.
+    """The environment of server and flows: the key is required, and analytics are off.
 
-    Prefect's state is in ``.prefect/`` of this folder unless PREFECT_HOME says otherwise.
+    Prefect's state is in ``.prefect/`` of this folder unless PREFECT_HOME names another one.
     """
     guards = {
         "PREFECT_API_AUTH_STRING": key,
@@ -113,7 +113,7 @@ def server_environment(url: str, key: str) -> dict[str, str]:
         "PREFECT_SERVER_API_CORS_ALLOWED_ORIGINS": _origin(url),
         "PREFECT_SERVER_API_CSRF_PROTECTION_ENABLED": "true",
         "PREFECT_CLIENT_CSRF_SUPPORT_ENABLED": "true",
-        "PREFECT_PLUGINS_ENABLED": "true",  # pipelines.prefect_hook guards the processes of flow runs
+        "PREFECT_PLUGINS_ENABLED": "true",  # pipelines.prefect_hook protects the processes of flow runs
         "PREFECT_PLUGINS_SAFE_MODE": "false",
     }
     home = os.environ.get("PREFECT_HOME", str(Path(".prefect").resolve()))
@@ -122,7 +122,7 @@ def server_environment(url: str, key: str) -> dict[str, str]:
 
 
 def wait_until_healthy(url: str, server: subprocess.Popen) -> None:
-    """Wait until ``server``, and no stranger, answers at ``url``. Raises MissingResource when it ends or never does."""
+    """Wait until ``server`` itself answers at ``url``. Raises MissingResource if it ends or does not answer in time."""
     deadline = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < deadline:
         if server.poll() is not None:
@@ -134,9 +134,9 @@ def wait_until_healthy(url: str, server: subprocess.Popen) -> None:
 
 
 def _listens(server: subprocess.Popen, url: str) -> bool:
-    """Whether it is this process that has the port: another user may have taken it while it started."""
+    """Whether this process listens at the port; another user's process may have taken it."""
     sockets = psutil.Process(server.pid).net_connections("tcp")
-    return any(found.status == psutil.CONN_LISTEN and found.laddr.port == urlsplit(url).port for found in sockets)
+    return any(item.status == psutil.CONN_LISTEN and item.laddr.port == urlsplit(url).port for item in sockets)
 
 
 def _answers(url: str) -> bool:
@@ -148,27 +148,26 @@ def _answers(url: str) -> bool:
 
 
 def _start_server(url: str, environment: dict[str, str]) -> subprocess.Popen:
-    """The server; what it writes, its database above all, is for the owner alone."""
+    """Start the server; its files, such as the database, are readable by the owner only."""
     address = urlsplit(url)
-    where = ("--host", str(address.hostname), "--port", str(address.port))
-    command = _module("prefect", "server", "start", *where, "--analytics-off")
+    options = ("--host", str(address.hostname), "--port", str(address.port))
+    command = _module("prefect", "server", "start", *options, "--analytics-off")
     return _start(command, environment, umask=0o077)
 
 
 def _start(command: list[str], environment: dict[str, str], **options: Any) -> subprocess.Popen:
-    """A process that ends with this one: alone it would send the key to whoever listens at the address next."""
+    """Start a process that ends with this one; otherwise it would send the key to the next server at the address."""
     return subprocess.Popen(command, env=environment, preexec_fn=partial(end_with_parent, os.getpid()), **options)
 
 
-def _module(*words: str) -> list[str]:
-    return [sys.executable, "-m", *words]
+def _module(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", *arguments]
 
 
 def write_key(path: Path = KEY_FILE) -> str:
-    """Put a new key in the place of the one before; returns it. Its folder is closed to other users first.
+    """Write and return a new key. Its folder is closed to other users first.
 
-    A key that others may have read, or that was sent to a stranger's server while ours was down, is worth nothing
-    from then on.
+    A new key at each start makes an old one worthless that others may have read or received.
     """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     path.parent.chmod(0o700)
@@ -181,20 +180,20 @@ def write_key(path: Path = KEY_FILE) -> str:
 
 
 def read_key(path: Path = KEY_FILE) -> str | None:
-    """The key; None where no server was started. Raises PermissionError when others can read it or wrote it."""
+    """The key; None if no server was started. Raises PermissionError if others can read or wrote the file."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     except FileNotFoundError:
         return None
     with os.fdopen(descriptor) as stream:
-        found = os.fstat(descriptor)
-        if found.st_uid != os.geteuid() or stat.S_IMODE(found.st_mode) & 0o077:
-            raise PermissionError(f"{path}: expected a file of mode 0600 that is yours; `hoidata up` makes a new one")
+        status = os.fstat(descriptor)
+        if status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & 0o077:
+            raise PermissionError(f"{path}: expected a file of mode 0600 that is yours; `hoidata up` writes a new one")
         return stream.read()
 
 
 def is_loopback(url: str | None) -> bool:
-    """Whether an address is a port of this machine out of reach for others; "localhost" is a name, and may be two."""
+    """Whether an address is a loopback IP with a port; not the name "localhost", which may mean two addresses."""
     try:
         address = urlsplit(url or "")
         return bool(address.port) and ip_address(address.hostname or "").is_loopback

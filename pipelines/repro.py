@@ -1,4 +1,4 @@
-"""The graph, after a look at whether what it is going to read is there: DVC itself looks too late."""
+"""`hoidata repro`: check that all raw files exist, then run the stale stages in parallel."""
 
 import os
 import sys
@@ -15,31 +15,36 @@ from pipelines.stages.base import StagePaths
 from pipelines.stages.code import write_code
 from pipelines.stages.raw import require_hand, write_generated
 
-MOST_JOBS = 4  # a stage can take a gigabyte or two of memory
+MAX_JOBS = 4  # a stage may need up to two gigabytes of memory
 
 
 def reproduce(
     targets: list[str], jobs: int = 0, wrap: Callable[[RunStage], RunStage] | None = None, force: bool = False
 ) -> Run:
-    """Preflight, then the targets (all when empty), up to ``jobs`` stages at once; 0: one per core, at most 4.
+    """Check the raw files, then update the targets.
 
-    wrap, force: see :func:`reproduce_side_by_side`.
+    Args:
+        targets: DVC targets; empty for all.
+        jobs: number of parallel stages; 0: one per core, at most 4.
+        wrap: see ``reproduce_side_by_side``.
+        force: see ``reproduce_side_by_side``.
 
-    Raises MissingResource before DVC starts when raw or MANO files that a stale stage needs are absent.
+    Raises:
+        MissingResource: raw or MANO files that a stale stage needs are missing.
     """
     preflight()
     os.environ.update(stage_environment())
-    return reproduce_side_by_side(targets, jobs or min(MOST_JOBS, len(os.sched_getaffinity(0))), wrap, force)
+    return reproduce_side_by_side(targets, jobs or min(MAX_JOBS, len(os.sched_getaffinity(0))), wrap, force)
 
 
 def stage_environment() -> dict[str, str]:
-    """The environment for ``dvc``: its stages run ``python``, which must be this one."""
+    """The environment for ``dvc``, whose stages call ``python`` and must find this interpreter."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     return {**os.environ, "PATH": path, "DVC_NO_ANALYTICS": "1"}
 
 
 def preflight() -> None:
-    """Write again a generated corpus that a conversion is about to read; refuse when the user's files are missing."""
+    """Write generated corpora that a conversion will read; raise MissingResource if the user's files are missing."""
     require_settings(Path())
     params = read_params(Path())
     runs = [StagePaths(params["profile"], name) for name in params["datasets"]]
@@ -86,13 +91,13 @@ def _is_readable(paths: StagePaths) -> bool:
 
 
 def _stale_stages(stages: list[str]) -> set[str]:
-    """Which of the stages DVC would run again."""
+    """Those of the stages that DVC would run again."""
     from dvc.repo import Repo
 
-    known = read_graph(Path())
-    wanted = [stage for stage in stages if stage in known]
-    if not wanted:
+    graph = read_graph(Path())
+    existing = [stage for stage in stages if stage in graph]
+    if not existing:
         return set()
     write_code(Path())
     with Repo() as repo:
-        return set(repo.status(targets=wanted))
+        return set(repo.status(targets=existing))

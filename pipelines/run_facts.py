@@ -1,4 +1,4 @@
-"""What a person reads after a run: clips, what was left out, leading figures of every row, where the pages are."""
+"""The summary of a run in Markdown: counts of clips, leading metrics of all methods, address of the report."""
 
 from pathlib import Path
 from typing import Any
@@ -11,22 +11,22 @@ from pipelines.stages.families import families_of
 
 
 def describe_results(project: Path, profile: str) -> str:
-    """Markdown: a row of counts per dataset, a table of leading figures for each that was measured, and the report."""
+    """Markdown with counts per dataset, a table of leading metrics per measured dataset, and the report's address."""
     params = read_params(project)
     notes: list[str] = []
-    lines = ["| dataset | clips | left out while converting | train | validation | test |", "|---|---|---|---|---|---|"]
+    lines = ["| dataset | clips | quarantined | train | validation | test |", "|---|---|---|---|---|---|"]
     tables: list[str] = []
     for dataset in params["datasets"]:
         data, metrics = project / "data" / profile / dataset, project / "metrics" / profile / dataset
         if (data / "clips/meta/info.json").is_file():
             lines.append(_counts(dataset, data))
-            notes += [f"{dataset}: {words}." for words in _splits(data).get("missing", {}).values()]
+            notes += [f"{dataset}: {note}." for note in _splits(data).get("missing", {}).values()]
         families = [name for name in families_of(params, dataset) if _measured(metrics / f"{name}.json")]
         if families:
             tables += [f"### {dataset}", markdown_table(metrics, families, LEADING)]
     report = project / "report" / profile / "index.html"
-    where = f"Report: {report.resolve()}" if report.is_file() else "The report has not been made yet."
-    return "\n\n".join(["\n".join(lines), *notes, *tables, where])
+    address = f"Report: {report.resolve()}" if report.is_file() else "There is no report yet."
+    return "\n\n".join(["\n".join(lines), *notes, *tables, address])
 
 
 def _counts(dataset: str, data: Path) -> str:
@@ -37,13 +37,13 @@ def _counts(dataset: str, data: Path) -> str:
 
 
 def _splits(data: Path) -> dict[str, Any]:
-    """What the stage split says of a dataset; nothing where it has not run."""
+    """The facts of the stage split of a dataset; empty before its first run."""
     path = data / "splits/info.json"
     if not path.is_file():
         return {}
-    found = read_json(path, {"chosen": {"clips": {}}})
-    found.check_present({"missing": dict})
-    return found
+    facts = read_json(path, {"chosen": {"clips": {}}})
+    facts.check_present({"missing": dict})
+    return facts
 
 
 def _measured(path: Path) -> bool:

@@ -1,6 +1,6 @@
-"""Facts of each run of a stage (when, how long, where) in ``.hoidata/runs``: beside its outputs, never in them.
+"""Facts of each run of a stage (time, duration, machine) in ``.hoidata/runs``, outside of the stage's outputs.
 
-They differ from run to run, so that DVC must not see them: nothing here is read by a stage, and all may be deleted.
+They differ from run to run, so DVC must not track them. No stage reads them, and they may be deleted.
 """
 
 import json
@@ -22,9 +22,10 @@ SCHEMA = "hoidata.run/1"
 
 @contextmanager
 def noted_run(name: str) -> Iterator[None]:
-    """Keep the facts of what the block does as those of the stage ``name``, also when it fails.
+    """Record the facts of the block as a run of a stage, also if it fails.
 
-    name: taken where DVC does not say which stage it runs.
+    Args:
+        name: of the stage, used if DVC does not set DVC_STAGE.
     """
     stage, began, start = os.environ.get("DVC_STAGE", name), datetime.now(UTC), time.monotonic()
     ended = "failed"
@@ -41,17 +42,20 @@ def noted_run(name: str) -> Iterator[None]:
             **_cost(),
             **_machine(),
         }
-        with suppress(OSError):  # of a full disk the stage itself has told
+        with suppress(OSError):  # the stage itself reports a full disk
             path = RUNS / f"{stage.replace('/', '-').replace(':', '-')}.json"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(json.dumps(facts, indent=1) + "\n")
 
 
 def _cost() -> dict[str, float]:
-    """Processor time and largest memory of this process and those it waited for."""
-    own, others = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    seconds = own.ru_utime + own.ru_stime + others.ru_utime + others.ru_stime
-    return {"processor_seconds": round(seconds, 2), "peak_mib": max(own.ru_maxrss, others.ru_maxrss) // 1024}
+    """Processor time and peak memory of this process and its children."""
+    self_usage, child_usage = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    seconds = self_usage.ru_utime + self_usage.ru_stime + child_usage.ru_utime + child_usage.ru_stime
+    return {
+        "processor_seconds": round(seconds, 2),
+        "peak_mib": max(self_usage.ru_maxrss, child_usage.ru_maxrss) // 1024,
+    }
 
 
 def _machine() -> dict[str, Any]:
@@ -72,7 +76,7 @@ def _machine() -> dict[str, Any]:
 
 
 def _device() -> str:
-    """The GPU that was used, else cpu; torch is not loaded to find out."""
+    """The GPU that was used, else "cpu"; does not import torch."""
     torch = sys.modules.get("torch")
     used = torch is not None and torch.cuda.is_initialized()
     return torch.cuda.get_device_name() if torch is not None and used else "cpu"

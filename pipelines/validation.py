@@ -1,4 +1,4 @@
-"""What ``hoidata validate`` finds: files that are not those their stage wrote, broken seals, a store's own faults."""
+"""`hoidata validate`: files that differ from dvc.lock, checkpoints with a wrong checksum, faults of stores."""
 
 from pathlib import Path
 
@@ -10,23 +10,23 @@ from pipelines.stages.base import empty_reason
 
 
 def problems_of(path: Path) -> tuple[list[BadInput], str]:
-    """Everything that is wrong with an output, and what to say of it when nothing is."""
-    made = _made(path)
-    problems = [item for root, lock, out in made for item in _others(root, lock, out, path)]
+    """All problems of an output, and a summary to print if there are none."""
+    outputs = _outputs_at(path)
+    problems = [item for root, lock, out in outputs for item in _changed_files(root, lock, out, path)]
     files = [path] if path.is_file() else sorted(path.rglob("*.safetensors"))
     problems += [problem for file in files if file.suffix == ".safetensors" and (problem := _broken_seal(file))]
-    known = f"as written by {', '.join(lock.name for _, lock, _ in made[:3])}{' and others' * (len(made) > 3)}"
+    summary = f"as written by {', '.join(lock.name for _, lock, _ in outputs[:3])}{' and others' * (len(outputs) > 3)}"
     if not (path / "meta").is_dir():
-        if not made and not files:
-            raise MissingResource(f"{path} is no store, checkpoint or output of a stage; name one of these")
-        return problems, known if made else "sound"
+        if not outputs and not files:
+            raise MissingResource(f"{path} is not a store, checkpoint or output of a stage; name one of these")
+        return problems, summary if outputs else "sound"
     if reason := empty_reason(path):
         return problems, f"empty, {reason}"
-    return problems + _of_store(path, bool(problems)), _store_in_words(path)
+    return problems + _store_problems(path, bool(problems)), _store_summary(path)
 
 
-def _made(path: Path) -> list[tuple[Path, Locked, str]]:
-    """Project, stage and output of what lies at the path, below it or around it."""
+def _outputs_at(path: Path) -> list[tuple[Path, Locked, str]]:
+    """Project, stage and output of all outputs at the path, below it or around it."""
     root = next((folder for folder in path.parents if (folder / "dvc.lock").is_file()), None)
     if root is None:
         return []
@@ -35,10 +35,10 @@ def _made(path: Path) -> list[tuple[Path, Locked, str]]:
     return [item for item in outs if name.is_relative_to(item[2]) or Path(item[2]).is_relative_to(name)]
 
 
-def _others(root: Path, lock: Locked, out: str, path: Path) -> list[BadInput]:
-    """Those of an output's files at the path that its stage did not write so."""
-    found = (root / name for name in other_files(root, lock, out))
-    concerned = [file for file in found if file.is_relative_to(path) or path.is_relative_to(file)]
+def _changed_files(root: Path, lock: Locked, out: str, path: Path) -> list[BadInput]:
+    """The files of an output at the path that differ from what its stage wrote."""
+    changed = (root / name for name in other_files(root, lock, out))
+    concerned = [file for file in changed if file.is_relative_to(path) or path.is_relative_to(file)]
     return [BadInput(file, f"the bytes {lock.name} wrote, by dvc.lock", "others", REMEDY) for file in concerned]
 
 
@@ -50,7 +50,7 @@ def _broken_seal(file: Path) -> BadInput | None:
     return BadInput(file, f"the {fault} it was written with, by its own digest", "others", REMEDY) if fault else None
 
 
-def _of_store(path: Path, is_known_broken: bool) -> list[BadInput]:
+def _store_problems(path: Path, is_known_broken: bool) -> list[BadInput]:
     from hoidata.store_check.check import check_store
 
     try:
@@ -59,7 +59,7 @@ def _of_store(path: Path, is_known_broken: bool) -> list[BadInput]:
         return [] if is_known_broken else [error]
 
 
-def _store_in_words(path: Path) -> str:
+def _store_summary(path: Path) -> str:
     from hoidata.store.store import open_store
 
     try:

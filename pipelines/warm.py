@@ -1,8 +1,8 @@
-"""Stages in forks of a process that has the libraries loaded: loading them takes seconds, a fork milliseconds.
+"""A pre-imported worker process that runs stages in forks: importing the libraries takes seconds, a fork milliseconds.
 
-`hoidata repro` holds one ``WarmProcess``. `python -m pipelines.stages` asks it, where the environment names one, to run
-the stage in a fork with the folder, environment, output and signals of the one that asks; else it runs it itself.
-Only libraries are loaded beforehand: the project's own modules are imported by each stage, as it starts.
+`hoidata repro` starts one ``WarmProcess``. If the environment names one, `python -m pipelines.stages` requests that it
+runs the stage in a fork, with the folder, environment, output and signals of the requesting process. Otherwise it runs
+the stage itself. Only libraries are pre-imported; each stage imports the project's modules.
 """
 
 import atexit
@@ -32,25 +32,25 @@ PRELOADED = (
     "numpy", "scipy.spatial.transform", "scipy.optimize", "scipy.stats", "pandas", "pyarrow.parquet", "numba", "orjson",
     "torch", "safetensors.torch", "trimesh", "igl", "rich.progress", "ruamel.yaml", "filelock", "threadpoolctl",
 )  # fmt: skip
-# Read as libraries are loaded. Threads of OpenMP that wait must sleep: spinning ones cost a busy machine ten times as
-# much. One thread of BLAS: its matrices are small here, two threads took five times as long and gave other last bits.
+# Libraries read these on import. Idle OpenMP threads must sleep: spinning ones cost ten times as much on a busy
+# machine. BLAS gets one thread: for small matrices two take five times as long, and change the last bits.
 ENVIRONMENT = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "0", "OPENBLAS_NUM_THREADS": "1", **same_kernels()}
-TAKEN = b"t"
+ACCEPTED = b"t"
 KILLED = 128 + signal.SIGKILL
 FORWARDED = (signal.SIGINT, signal.SIGTERM)
 
 
 class WarmProcess:
-    """The process that forks. environment: what a stage needs to find it. It ends with this object or its owner."""
+    """The pre-imported process. It ends with this object and with the process that owns it."""
 
     def __init__(self) -> None:
         self.folder = tempfile.TemporaryDirectory(prefix="hoidata-warm-")  # readable by the user alone
         self.path = str(Path(self.folder.name) / "socket")
-        self.environment = {SOCKET: self.path}
+        self.environment = {SOCKET: self.path}  # for stages, to find this process
         self.process: subprocess.Popen | None = None
 
     def start(self) -> None:
-        """Begin to load the libraries; a stage that asks meanwhile waits as long as it would take itself."""
+        """Start the process, which then imports the libraries; a stage that sends a request meanwhile waits."""
         self.process = subprocess.Popen(
             [sys.executable, "-m", "pipelines.warm", self.path],
             stdin=subprocess.PIPE,
@@ -60,7 +60,7 @@ class WarmProcess:
         )
 
     def close(self) -> None:
-        """End it; stages under way go on."""
+        """Kill the process; running stages continue."""
         if self.process:
             self.process.kill()
             self.process.communicate()
@@ -68,15 +68,15 @@ class WarmProcess:
 
 
 def run_warm(module: str, arguments: list[str]) -> int | None:
-    """Exit code of ``python -m module`` run by the warm process, or None where there is none to ask."""
+    """Run ``python -m module`` in a fork of the warm process. Returns the exit code, or None without such a process."""
     path = os.environ.get(SOCKET)
     if not path:
         return None
     with socket.socket(socket.AF_UNIX) as connection:
         try:
             connection.connect(path)
-            _ask(connection, {"module": module, "arguments": arguments})
-            if connection.recv(1) != TAKEN:
+            _send_request(connection, {"module": module, "arguments": arguments})
+            if connection.recv(1) != ACCEPTED:
                 return None
         except OSError:
             return None
@@ -86,22 +86,22 @@ def run_warm(module: str, arguments: list[str]) -> int | None:
         return answer[0] if answer else KILLED
 
 
-def _ask(connection: socket.socket, asked: dict[str, Any]) -> None:
+def _send_request(connection: socket.socket, request: dict[str, Any]) -> None:
     environment = {key: value for key, value in os.environ.items() if key != SOCKET}
-    body = json.dumps({**asked, "folder": os.getcwd(), "path": sys.path, "environment": environment}).encode()
+    body = json.dumps({**request, "folder": os.getcwd(), "path": sys.path, "environment": environment}).encode()
     socket.send_fds(connection, [struct.pack("!I", len(body))], [0, 1, 2])
     connection.sendall(body)
 
 
 def serve(path: str, preloaded: Sequence[str] = PRELOADED) -> None:
-    """Listen, load the libraries, and fork for each stage that asks, until standard input ends."""
+    """Listen, import the libraries, and fork for each request until standard input ends."""
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(path)
     listener.listen(64)
     threading.Thread(target=_end_with_input, daemon=True).start()
     for name in preloaded:
         import_module(name)
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the forks here
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel reaps the forks
     while True:
         connection, _ = listener.accept()
         if os.fork() == 0:
@@ -116,15 +116,17 @@ def _end_with_input() -> None:
 
 
 def _answer(connection: socket.socket) -> None:
-    """In the fork: run what is asked and send its exit code; a fork that was killed sends nothing."""
+    """Run a request in the fork and send the exit code; a fork that is killed sends nothing."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started all this to ignore it
+    signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a shell may have started this process with SIGINT ignored
     end_on_signals()
     os.setpgrp()
     code = 1
     try:
         request = _receive(connection)
-        connection.sendall(TAKEN)
+        connection.sendall(ACCEPTED)
         threading.Thread(target=_pass_signals_on, args=(connection,), daemon=True).start()
         code = _run(request)
     except BaseException:
@@ -143,17 +145,17 @@ def _receive(connection: socket.socket) -> dict[str, Any]:
     body = b""
     while len(body) < struct.unpack("!I", head)[0]:
         body += connection.recv(1 << 16)
-    for own, given in enumerate(descriptors):
-        os.dup2(given, own)
-        os.close(given)
-    # Those of this process were opened on /dev/null, and believe that it is what they write to.
+    for number, descriptor in enumerate(descriptors):
+        os.dup2(descriptor, number)
+        os.close(descriptor)
+    # The streams of this process were opened on /dev/null, so they are opened again.
     sys.stdout, sys.stderr = (os.fdopen(number, "w", 1, closefd=False) for number in (1, 2))
     return json.loads(body)
 
 
 def _pass_signals_on(connection: socket.socket) -> None:
-    """Signals for the one that asks are for the stage and its workers too; and without it there is no one to answer."""
-    with suppress(ConnectionError):  # one that was killed may not have read all: its end is a reset then
+    """Pass signals of the requesting process on to the stage and its workers; kill them when that process ends."""
+    with suppress(ConnectionError):  # a killed process may not have read everything, which resets the connection
         while received := connection.recv(1):
             os.killpg(0, received[0])
     os.killpg(0, signal.SIGKILL)
@@ -162,8 +164,8 @@ def _pass_signals_on(connection: socket.socket) -> None:
 def _run(request: dict[str, Any]) -> int:
     os.chdir(request["folder"])
     os.environ.clear()
-    os.environ.update({**request["environment"], **ENVIRONMENT})  # its worker processes read it anew
-    # The stage's own modules are those that the one that asks would import.
+    os.environ.update({**request["environment"], **ENVIRONMENT})  # worker processes read them again
+    # The stage imports the project's modules from the same path as the requesting process.
     sys.path[:] = request["path"]
     for name in [name for name in sys.modules if name.partition(".")[0] == "pipelines"]:
         del sys.modules[name]

@@ -1,4 +1,4 @@
-"""Fixtures shared by all tests, whose builders are in tests/builders; and the order in which modules begin."""
+"""Fixtures for all tests, and the order of the test modules. Builders of data are in tests/builders."""
 
 import os
 import pickle
@@ -17,11 +17,11 @@ from tests.builders.clips import build_clip
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """xdist would begin with the modules of many tests, and end with the few that take minutes."""
+    """Start slow modules first; xdist would start with the modules of many tests, and end with slow ones."""
     config.option.loadscopereorder = False
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        # In the background of a script; processes that tests start and interrupt would ignore it by inheritance.
+        # Tests in the background of a script inherit an ignored SIGINT, and so would the processes that they interrupt.
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -31,8 +31,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(autouse=True)
 def _usual_process() -> Iterator[None]:
-    """Commands set threads, precision and algorithms of the process, and what files are checked against; no test, and
-    no fixture that tests share, is to notice which ran before it."""
+    """Reset process settings that commands change: threads, precision, algorithms and digest checks."""
     yield
     if written := sys.modules.get("hoidata.files.written"):
         written._digest_sources.clear()
@@ -50,7 +49,7 @@ def make_clip() -> Callable[..., Clip]:
 
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
-    """Call it with a name and a function that fills a folder: filled once for all workers. Tests change only copies."""
+    """A function (name, fill) that returns a folder, filled once for all workers; tests change only copies."""
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
@@ -69,7 +68,7 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
 
 @pytest.fixture(scope="session")
 def small_corpus(made_once) -> Callable[[str], SimpleNamespace]:
-    """Call it with a dataset's name: its small embedded corpus (raw), converted (clips), and what it was made from."""
+    """A function that returns the small embedded corpus of a dataset: raw files, clips and their sources."""
     from hoidata.conversion.convert import convert_dataset
     from hoidata.datasets import get_adapter
     from hoidata.hands import load_embedded_hands

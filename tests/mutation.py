@@ -1,8 +1,8 @@
 """Mutation tests with mutmut: ``python -m tests.mutation hoidata/contact --sample 60`` (``make mutation``).
 
 mutmut changes one expression of a function at a time in a copy of the tree (``mutants/``) and runs those tests of the
-package that call this function. A change that no test notices has survived. Decorated functions are not changed; among
-them are the compiled kernels.
+package that call this function. A change that no test detects has survived. Decorated functions, such as the compiled
+kernels, are not changed.
 """
 
 import argparse
@@ -41,7 +41,7 @@ def main() -> int:
 
 
 def _sampled(path: str, count: int, seed: int) -> list[str]:
-    """Names of at most ``count`` mutants of a package, in the order of the files."""
+    """The names of at most ``count`` mutants of a package, in the order of the files."""
     files = sorted(Path(path).rglob("*.py"))
     changed = {file: mutate_file_contents(str(file), file.read_text()).mutant_names for file in files}
     names = [get_mutant_name(file, name) for file in files for name in changed[file]]

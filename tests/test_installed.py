@@ -1,4 +1,4 @@
-"""The wheel in an environment of its own: nothing but the name hoidata is taken, and the bytes are those of a clone."""
+"""The wheel in a new environment: it installs only the name hoidata, and gives the same bytes as a clone."""
 
 import filecmp
 import json
@@ -20,21 +20,21 @@ BESIDE = (
     *("pyproject.toml", "setup.py", "dvc.yaml", "params.yaml", "prefect.toml", "manifests", "README.md", "NOTICE"),
     *("LICENSE*", ".dvc", ".dvcignore", ".gitignore"),
 )
-# A user's own packages, which have nothing to do with hoidata.
+# Packages of the user, unrelated to hoidata.
 USERS = "from models import mine\nfrom pipelines import own\nimport hoidata.errors\nprint(mine, own)"
 BOTH = "import models\nfrom hoidata.package_paths import add_to_path\nadd_to_path()"
 
 
 def run(python: Path, folder: Path, *words: str, **more: str) -> subprocess.CompletedProcess:
-    kept = {key: value for key, value in os.environ.items() if not key.startswith(("HOIDATA_", "PYTHONPATH"))}
-    path = f"{python.parent}{os.pathsep}{kept['PATH']}"
-    environment = {**kept, "PATH": path, "OMP_NUM_THREADS": "1", "DVC_NO_ANALYTICS": "1", **more}
+    variables = {key: value for key, value in os.environ.items() if not key.startswith(("HOIDATA_", "PYTHONPATH"))}
+    path = f"{python.parent}{os.pathsep}{variables['PATH']}"
+    environment = {**variables, "PATH": path, "OMP_NUM_THREADS": "1", "DVC_NO_ANALYTICS": "1", **more}
     return subprocess.run([python, *words], cwd=folder, env=environment, capture_output=True, text=True)
 
 
 @pytest.fixture(scope="module")
 def python(tmp_path_factory) -> Path:
-    """The Python of an environment in which the wheel is installed; other packages are those of this one."""
+    """The Python of an environment with the wheel and the packages of this environment."""
     folder = tmp_path_factory.mktemp("installed")
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", "--", *OURS, *BESIDE]
     files = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=True).stdout
@@ -55,7 +55,7 @@ def python(tmp_path_factory) -> Path:
 
 
 def _take_compiled(package: Path) -> None:
-    """What numba compiled here serves there too: it asks for the time of change of the source."""
+    """Copy numba's compiled code, and give the sources the modification times that it checks."""
     for cached in (path for name in OURS for path in (PROJECT / name).rglob("__pycache__/*.nb?")):
         source = cached.parents[1] / f"{cached.name.partition('.')[0]}.py"
         below = source.relative_to(PROJECT / "hoidata") if source.is_relative_to(PROJECT / "hoidata") else None
@@ -73,11 +73,11 @@ def test_a_project_of_the_wheel_gives_the_bytes_of_a_clone(python, tmp_path, sma
         path.write_text(path.read_text().replace('"size": "full"', '"size": "small"'))
     done = run(python, project, "-m", "hoidata", "repro", "convert@embedded-grab")
     assert done.returncode == 0, done.stdout + done.stderr
-    reference, made = small_corpus("grab").clips, project / "data/embedded/grab/clips"
+    reference, clips = small_corpus("grab").clips, project / "data/embedded/grab/clips"
     names = sorted(path.relative_to(reference) for path in reference.rglob("*") if path.is_file())
-    assert names == sorted(path.relative_to(made) for path in made.rglob("*") if path.is_file())
-    assert filecmp.cmpfiles(reference, made, names, shallow=False)[1:] == ([], [])
-    # Checkpoints carry the digests of the code: they must not tell a clone from a wheel.
+    assert names == sorted(path.relative_to(clips) for path in clips.rglob("*") if path.is_file())
+    assert filecmp.cmpfiles(reference, clips, names, shallow=False)[1:] == ([], [])
+    # Checkpoints have digests of the code, which must be equal in a clone and a wheel.
     for name, digests in code_today(PROJECT).items():
         assert json.loads((project / name).read_text()) == digests, name
 

@@ -1,6 +1,6 @@
-"""Counts of the papers and of the datasets that needs no data, beside the code that must agree with it.
+"""Counts in the papers and dataset releases, compared with the code; needs no data.
 
-Numbers are typed from the papers (section or table named) and from what the datasets' makers publish. How many clips a
+Numbers are from the papers (with section or table) and from the dataset publications. How many clips a
 paper counts (Text2HOI: 660, 1,335 and 4,597) can only be checked on the licensed files.
 """
 
@@ -39,9 +39,9 @@ class TestH2O:
 
     def test_184_sequences_with_eight_gaps_of_the_full_grid(self):
         grid = {
-            f"subject{person}/{place}/{take}"
+            f"subject{person}/{scene}/{take}"
             for person in (1, 2, 3, 4)
-            for place in ("h1", "h2", "k1", "k2", "o1", "o2")
+            for scene in ("h1", "h2", "k1", "k2", "o1", "o2")
             for take in range(8)
         }
         sequences = set(published("h2o").sequences)
@@ -140,11 +140,11 @@ class TestText2Hoi:
 
     def test_noise_has_1000_steps(self):
         """Section 4.1: T = 1,000, cosine schedule (Nichol and Dhariwal 2021)."""
-        share = alphas_cumprod()
-        assert share.shape == (1000,)
+        cumulative_alpha = alphas_cumprod()
+        assert cumulative_alpha.shape == (1000,)
         steps = (torch.arange(1000) + 1) / 1000
         cosine = torch.cos((steps + 0.008) / 1.008 * torch.pi / 2) ** 2 / np.cos(0.008 / 1.008 * np.pi / 2) ** 2
-        np.testing.assert_allclose(share[:900].numpy(), cosine[:900].numpy(), atol=2e-3)
+        np.testing.assert_allclose(cumulative_alpha[:900].numpy(), cosine[:900].numpy(), atol=2e-3)
 
     def test_the_transformer_has_8_layers_of_512_with_4_heads_and_1024_inside(self):
         """Supplement, Table S8."""

@@ -1,4 +1,4 @@
-"""A reader finds what the documents name: every file they point to is there."""
+"""All files that the documents name exist."""
 
 import re
 from pathlib import Path
@@ -8,7 +8,7 @@ import hoidata
 ROOT = Path(__file__).parents[1]
 
 
-def test_every_question_of_a_newcomer_is_answered_by_files_that_exist():
+def test_all_files_in_the_guide_for_newcomers_exist():
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").split("## Where is it?")[1].split("\n## ")[0]
     answers = re.findall(r"^\| .+\? \| (.+) \|$", text, re.MULTILINE)
     assert len(answers) >= 12
@@ -16,10 +16,12 @@ def test_every_question_of_a_newcomer_is_answered_by_files_that_exist():
     assert missing == []
 
 
-def test_the_table_of_packages_names_every_package_and_no_other():
+def test_the_table_of_packages_lists_exactly_the_packages():
     text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8").split("| package |")[1].split("\n\n")[0]
     named = {
-        room for row in text.splitlines()[2:] for room in re.findall(r"`(\w+)`", row.replace("\\|", "/").split("|")[1])
+        package
+        for line in text.splitlines()[2:]
+        for package in re.findall(r"`(\w+)`", line.replace("\\|", "/").split("|")[1])
     }
     folders = {path.parent.name for path in Path(hoidata.__path__[0]).glob("*/__init__.py")}
     modules = {path.stem for path in Path(hoidata.__path__[0]).glob("*.py")} - {"__init__"}

@@ -1,4 +1,4 @@
-"""The drawings of docs/concepts, made from the data of `make demo`: python -m docs.make.drawings PROJECT."""
+"""Plots for docs/concepts from the data of `make demo`: `python -m docs.make.drawings PROJECT`."""
 
 import json
 import sys
@@ -27,12 +27,20 @@ BLUE, SAND, GREY, RED, GREEN = "#7a9fc6", "#e6b087", "#d6d4cc", "#c4571b", "#7f9
 COLOURS = {"left": BLUE, "right": SAND}
 CLIP = "grab/s10/mug_drink_1"
 TOUCH = matplotlib.colors.LinearSegmentedColormap.from_list("touch", ["#d6d4cc", "#f29e40", "#c71f24"])
-PARTS = {"train": "#9fb8d3", "validation": "#e9c46a", "test": "#c4571b", "left out": "#eeeeee"}
+SUBSET_COLOURS = {"train": "#9fb8d3", "validation": "#e9c46a", "test": "#c4571b", "excluded": "#eeeeee"}
 HANDS = load_embedded_hands()
 
 
 def mesh(axes, vertices: np.ndarray, faces: np.ndarray, colour, opacity: float = 1.0) -> None:
-    """A shaded surface: vertices (vertex, 3) metres; colour: one, or (face, 3)."""
+    """Draw a shaded mesh.
+
+    Args:
+        axes: 3D axes.
+        vertices: (vertex, 3), metres.
+        faces: (face, 3) indices.
+        colour: one colour, or (face, 3).
+        opacity: 0 to 1.
+    """
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
@@ -42,7 +50,7 @@ def mesh(axes, vertices: np.ndarray, faces: np.ndarray, colour, opacity: float =
 
 
 def frame_of(axes, centre: np.ndarray, radius: float, view: tuple[float, float] = (18, -60)) -> None:
-    """The part of the world that is seen, without the box around it."""
+    """Set limits and view of 3D axes, and hide their box."""
     for set_limits, middle in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), centre, strict=True):
         set_limits(middle - radius, middle + radius)
     axes.set_box_aspect((1, 1, 1), zoom=1.5)
@@ -53,7 +61,7 @@ def frame_of(axes, centre: np.ndarray, radius: float, view: tuple[float, float] 
 def triad(
     axes, origin: np.ndarray, length: float, names: tuple[str, ...] = ("x", "y", "z"), up: int | None = 2
 ) -> None:
-    """Three axes; the one that points up is drawn bold."""
+    """Draw three coordinate axes, with the up axis in bold."""
     for number, name in enumerate(names):
         tip = origin + length * np.eye(3)[number]
         bold = number == up
@@ -67,7 +75,7 @@ def hand_vertices(side: str, track, frame: int) -> np.ndarray:
 
 
 def draw_clip(figure: Figure, data: Path) -> None:
-    """Four moments of one clip, all in the source's world."""
+    """Plot four frames of one clip in the source's world."""
     clip = load_annotated(data / "grab", HANDS).clip(CLIP)
     for number, frame in enumerate(np.linspace(0, clip.n_frames - 1, 4).astype(int)):
         axes = figure.add_subplot(1, 4, number + 1, projection="3d")
@@ -84,7 +92,7 @@ def draw_clip(figure: Figure, data: Path) -> None:
 
 
 def draw_conventions(figure: Figure, data: Path) -> None:
-    """What zero angles, the translation and up mean in each source, drawn on the same right hand."""
+    """Plot the meaning of zero angles, translation and up axis in each source, on the same right hand."""
     model = HANDS["right"]
     wrist = model.wrist_offset_m(np.zeros((1, 10)))[0]
     for number, name in enumerate(built_in_names()):
@@ -94,16 +102,16 @@ def draw_conventions(figure: Figure, data: Path) -> None:
         pose = model.mean_pose if convention.fingers == "mean-relative" else np.zeros(45)
         vertices = posed(pose)
         mesh(axes, vertices, model.faces, SAND, 0.9)
-        place = wrist if convention.translation == "wrist" else np.zeros(3)
+        origin = wrist if convention.translation == "wrist" else np.zeros(3)
         axes.computed_zorder = False
-        axes.scatter(*place, color=RED, s=34, depthshade=False, zorder=5)
-        axes.plot(*np.stack([place, wrist]).T, color=RED, linewidth=2, zorder=4)
+        axes.scatter(*origin, color=RED, s=34, depthshade=False, zorder=5)
+        axes.plot(*np.stack([origin, wrist]).T, color=RED, linewidth=2, zorder=4)
         frame_of(axes, np.array((0.0, 0.0, 0.0)), 0.14, (14, -82))
         up = None if frame.up_axis is None else "xyz".index(frame.up_axis[-1])
         triad(axes, np.array((-0.1, 0.0, -0.13)), 0.05, up=up)
-        where = "the wrist" if convention.translation == "wrist" else "J0 short of the wrist"
+        reference = "the wrist" if convention.translation == "wrist" else "the wrist minus J0"
         lines = [
-            f"translation: {where}",
+            f"translation: {reference}",
             f"zero angles: {'the mean pose' if convention.fingers == 'mean-relative' else 'a flat hand'}",
             f"shape: {convention.shape}",
             f"up: {frame.up_axis or frame.gravity}",
@@ -117,12 +125,12 @@ def posed(pose: np.ndarray) -> np.ndarray:
     """(778, 3) vertices of the right hand at its model's origin with absolute finger angles (45,)."""
     model, zero = HANDS["right"], np.zeros((1, 3))
     wrist = model.wrist_offset_m(np.zeros((1, 10)))
-    track = HandTrack(wrist, zero, np.asarray(pose)[None], np.zeros((1, 10)), np.ones(1, bool))
+    track = HandTrack(wrist, zero, np.asarray(pose)[None], betas=np.zeros((1, 10)), valid=np.ones(1, bool))
     return hand_vertices("right", track, 0)
 
 
 def draw_contact(figure: Figure, data: Path) -> None:
-    """The contact map of a clip, and BimArt's distances of one frame, on the same 1,024 points."""
+    """Plot the contact map of a clip and BimArt's distances in one frame, on the same 1,024 points."""
     annotated = load_annotated(data / "grab", HANDS)
     clip, sampled = annotated.clip(CLIP), annotated.points(annotated.object_key(CLIP))
     frame, side, points = clip.n_frames // 2, annotated.hand_type(CLIP), sampled.points_m
@@ -130,19 +138,19 @@ def draw_contact(figure: Figure, data: Path) -> None:
     surface = measure_hand(clip, side, HANDS, sampled)
     touched = annotated.touched_frames(CLIP, side)
     maps = {
-        "touched within 2 cm of a joint": (touched / clip.n_frames, TOUCH, "share of the frames"),
+        "touched within 2 cm of a joint": (touched / clip.n_frames, TOUCH, "fraction of the frames"),
         f"metres to the {side} hand, frame {frame}": (surface.map_m[frame], "RdYlBu", "m"),
     }
     for number, (title, (values, colours, unit)) in enumerate(maps.items()):
         axes = figure.add_subplot(1, 2, number + 1, projection="3d")
-        drawn = axes.scatter(*points.T, c=values, cmap=colours, s=9, depthshade=False)
+        scatter = axes.scatter(*points.T, c=values, cmap=colours, s=9, depthshade=False)
         frame_of(axes, points.mean(axis=0), np.ptp(points, axis=0).max() * 0.5)
         axes.set_title(title, fontsize=10)
-        figure.colorbar(drawn, ax=axes, shrink=0.6, label=unit)
+        figure.colorbar(scatter, ax=axes, shrink=0.6, label=unit)
 
 
 def draw_hand_type(figure: Figure, data: Path) -> None:
-    """How near each hand comes in every frame: what decides who acts."""
+    """Plot the distance of each hand to the object in each frame, which decides the hand type."""
     annotated = load_annotated(data / "grab", HANDS)
     evidence = annotated.hand_evidence(CLIP)
     axes: Axes = figure.add_subplot()
@@ -156,8 +164,8 @@ def draw_hand_type(figure: Figure, data: Path) -> None:
     axes.legend(frameon=False)
 
 
-def draw_words(figure: Figure, data: Path) -> None:
-    """How alike the features of sentences are: the four of one clip, and those of other verbs, objects and hands."""
+def draw_text_features(figure: Figure, data: Path) -> None:
+    """Plot the cosine similarity of text features: four sentences each of five clips."""
     annotated = load_annotated(data / "grab", HANDS)
     prompts: dict[tuple, str] = {}
     for clip_id in annotated.ids("test"):
@@ -177,69 +185,72 @@ def draw_words(figure: Figure, data: Path) -> None:
 
 
 def draw_quality(figure: Figure, data: Path) -> None:
-    """Every measure of every clip, as a share of the limit above which it is reported."""
+    """Plot all quality measures of all clips, as fractions of the limit above which they are reported."""
     axes: Axes = figure.add_subplot()
     folders = {name: data / name / "quality" for name in ("h2o", "grab", "arctic")}
     limits = json.loads((folders["h2o"] / "info.json").read_text())["thresholds"]["limits"]
     clips = {name: pd.read_parquet(folder / "clips.parquet") for name, folder in folders.items()}
     names = [name for name in reversed(limits) if name in clips["h2o"]]
     for offset, (dataset, colour) in zip((0.22, 0, -0.22), zip(clips, (BLUE, SAND, GREEN), strict=True), strict=True):
-        for row, name in enumerate(names):
-            shares = clips[dataset][name].dropna().abs() / limits[name]["warn"]
-            axes.plot(shares, np.full(len(shares), row + offset), "o", color=colour, alpha=0.5, markersize=4)
+        for y, name in enumerate(names):
+            fractions = clips[dataset][name].dropna().abs() / limits[name]["warn"]
+            axes.plot(fractions, np.full(len(fractions), y + offset), "o", color=colour, alpha=0.5, markersize=4)
         axes.plot([], [], "o", color=colour, label=dataset_title(dataset))
     axes.axvline(1, color=RED, linewidth=1.5, label="reported above")
     axes.set_yticks(range(len(names)), names, fontsize=8)
     axes.set_xlim(-0.03, 1.15)
-    axes.set_xlabel("measure, as a share of its limit `warn`")
+    axes.set_xlabel("measure, as a fraction of its limit `warn`")
     axes.legend(frameon=False, fontsize=8, loc="center", bbox_to_anchor=(0.78, 0.22))
 
 
 def draw_splits(figure: Figure, data: Path) -> None:
-    """Subjects by objects, coloured by the part their clips are in, for two named splits of one corpus."""
+    """Plot clips by subject and object, coloured by subset, for two named splits of one corpus."""
     annotated = load_annotated(data / "grab", HANDS)
-    rows = pd.read_parquet(data / "grab/splits/splits.parquet").merge(annotated.store.sequences.reset_index(drop=True))
-    rows["subject"] = rows["subject"].astype(str)
-    subjects = sorted(set(rows["subject"]), key=lambda name: (len(name), name))
-    objects = sorted(set(rows["object"]))
+    clips = pd.read_parquet(data / "grab/splits/splits.parquet").merge(annotated.store.sequences.reset_index(drop=True))
+    clips["subject"] = clips["subject"].astype(str)
+    subjects = sorted(set(clips["subject"]), key=lambda name: (len(name), name))
+    objects = sorted(set(clips["object"]))
     for number, name in enumerate(("text2hoi", "unseen-object")):
         axes: Axes = figure.add_subplot(1, 2, number + 1)
-        for _, row in rows.iterrows():
-            part = PARTS.get(str(row[name]), PARTS["left out"])
-            axes.scatter(objects.index(row["object"]), subjects.index(row["subject"]), marker="s", s=70, color=part)
+        for _, clip in clips.iterrows():
+            colour = SUBSET_COLOURS.get(str(clip[name]), SUBSET_COLOURS["excluded"])
+            axes.scatter(objects.index(clip["object"]), subjects.index(clip["subject"]), marker="s", s=70, color=colour)
         axes.set_xticks(range(len(objects)), objects, rotation=90, fontsize=7)
         axes.set_yticks(range(len(subjects)), subjects, fontsize=8)
         axes.set_title(name, loc="left", fontsize=10)
-    legend = [Patch(color=colour, label=part) for part, colour in PARTS.items()]
+    legend = [Patch(color=colour, label=subset) for subset, colour in SUBSET_COLOURS.items()]
     figure.legend(handles=legend, ncol=4, loc="outside upper right", frameon=False, fontsize=8)
 
 
 def draw_lineage(figure: Figure, data: Path) -> None:
-    """The stages of one dataset and family as DVC has them, each below all it is made from."""
-    known = written_graph(data.parents[1])
-    graph = {name: stage for name, stage in known.items() if _is_drawn(name)}
-    made = {out: name for name, stage in graph.items() for out in stage.outs}
-    parents = {name: {made[path] for path in stage.data if path in made} for name, stage in graph.items()}
+    """Plot the DVC stages of one dataset and family, each below its inputs."""
+    graph = {name: stage for name, stage in written_graph(data.parents[1]).items() if _is_plotted(name)}
+    producers = {out: name for name, stage in graph.items() for out in stage.outs}
+    parents = {name: {producers[path] for path in stage.data if path in producers} for name, stage in graph.items()}
     depth: dict[str, int] = {}
     while len(depth) < len(parents):
         ready = [name for name in parents if name not in depth and parents[name] <= depth.keys()]
         depth |= {name: 1 + max((depth[parent] for parent in parents[name]), default=-1) for name in ready}
     levels = [[name for name in depth if depth[name] == level] for level in range(max(depth.values()) + 1)]
-    places = {n: ((i + 0.5) / len(level), -row) for row, level in enumerate(levels) for i, n in enumerate(level)}
+    positions = {
+        name: ((index + 0.5) / len(level), -number)
+        for number, level in enumerate(levels)
+        for index, name in enumerate(level)
+    }
     axes: Axes = figure.add_subplot()
     arrow = {"arrowstyle": "-|>", "color": "#9aa0a6", "shrinkA": 11, "shrinkB": 11}
     for name, above in parents.items():
         for parent in above:
-            axes.annotate("", places[name], places[parent], arrowprops=arrow)
+            axes.annotate("", positions[name], positions[parent], arrowprops=arrow)
     box = {"boxstyle": "round,pad=0.4", "facecolor": "#eef3f8", "edgecolor": BLUE}
-    for name, place in places.items():
-        axes.text(*place, _label(name), ha="center", va="center", fontsize=9, bbox=box)
+    for name, position in positions.items():
+        axes.text(*position, _label(name), ha="center", va="center", fontsize=9, bbox=box)
     axes.set_ylim(-len(levels) + 0.5, 0.5)
     axes.set_xlim(0, 1)
     axes.set_axis_off()
 
 
-def _is_drawn(name: str) -> bool:
+def _is_plotted(name: str) -> bool:
     stage, _, rest = name.rpartition(":")[2].partition("@")
     if (
         stage in ("code", "controls", "evaluator", "report")
@@ -261,18 +272,18 @@ DRAWINGS: dict[str, tuple[Callable[[Figure, Path], None], tuple[float, float]]] 
     "conventions": (draw_conventions, (12, 8.5)),
     "contact": (draw_contact, (10, 4.2)),
     "hand-type": (draw_hand_type, (8, 3.2)),
-    "words": (draw_words, (9, 5)),
+    "words": (draw_text_features, (9, 5)),
     "quality": (draw_quality, (9, 4.6)),
     "splits": (draw_splits, (11, 4.4)),
     "lineage": (draw_lineage, (9, 6)),
 }
 
 
-FLAT = ("hand-type", "words", "quality", "splits", "lineage")  # the others have a view in space
+FLAT = ("hand-type", "words", "quality", "splits", "lineage")  # the others are 3D plots
 
 
 def main(project: Path, names: list[str]) -> None:
-    """Draw all, or the named ones, into docs/images."""
+    """Write all plots, or the named ones, to docs/images."""
     for name, (draw, inches) in DRAWINGS.items():
         if not names or name in names:
             figure = Figure(figsize=inches, layout="constrained" if name in FLAT else None)

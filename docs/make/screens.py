@@ -1,6 +1,6 @@
-"""Pictures of the pages of `make demo`, taken in headless Chromium: python -m docs.make.screens PROJECT.
+"""Screenshots of the pages of `make demo` in headless Chromium: `python -m docs.make.screens PROJECT`.
 
-A generated motion as an animated WebP, the page of a generated motion, and the report.
+They show a generated motion as an animated WebP, the page of a generated motion, and the report.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ from websockets.asyncio.client import ClientConnection, connect
 
 from hoidata.hands import load_embedded_hands
 from models.text2hoi.generation import Wish
-from pipelines.generation import Asked, generate_files
+from pipelines.generation import GenerationRequest, generate_files
 from pipelines.showing import write_shown_of
 
 IMAGES = Path(__file__).parents[1] / "images"
@@ -37,7 +37,7 @@ SENTENCE = "Drink from a mug with the right hand."
 
 
 class Page:
-    """One tab, driven through Chromium's own protocol."""
+    """One browser tab, driven through the Chrome DevTools Protocol."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self.socket, self.count = socket, 0
@@ -50,8 +50,8 @@ class Page:
         return answer["result"]
 
     async def run(self, script: str) -> Any:
-        found = await self.call("Runtime.evaluate", expression=script, awaitPromise=True)
-        return found["result"].get("value")
+        answer = await self.call("Runtime.evaluate", expression=script, awaitPromise=True)
+        return answer["result"].get("value")
 
     async def open(self, path: Path, width: int, height: int, players: int) -> None:
         await self.call(
@@ -66,11 +66,12 @@ class Page:
 
     async def picture(self, **clip: float) -> Image.Image:
         area = {"clip": {**clip, "scale": 1}} if clip else {}
-        found = await self.call("Page.captureScreenshot", format="png", **area)
-        return Image.open(io.BytesIO(base64.b64decode(found["data"]))).convert("RGB")
+        answer = await self.call("Page.captureScreenshot", format="png", **area)
+        return Image.open(io.BytesIO(base64.b64decode(answer["data"]))).convert("RGB")
 
 
 async def take(project: Path, folder: Path) -> None:
+    """Take all screenshots and write them to docs/images."""
     address = next(tab for tab in _tabs() if tab["type"] == "page")["webSocketDebuggerUrl"]
     async with connect(address, max_size=None) as socket:
         page = Page(socket)
@@ -92,10 +93,10 @@ async def take(project: Path, folder: Path) -> None:
 
 
 def generated(project: Path, folder: Path) -> Path:
-    """The page of two motions for a sentence, made in the project."""
+    """Generate two motions for a sentence in the project, and return the path of their page."""
     chdir(project)
-    asked = Asked(SENTENCE, "mug", "embedded", ("grab",), wish=Wish(seed=1, samples=2))
-    return generate_files(asked, folder / "generated").paths[-1]
+    request = GenerationRequest(SENTENCE, "mug", "embedded", ("grab",), wish=Wish(seed=1, samples=2))
+    return generate_files(request, folder / "generated").paths[-1]
 
 
 def _tabs() -> list[dict[str, Any]]:
@@ -104,7 +105,7 @@ def _tabs() -> list[dict[str, Any]]:
 
 
 def main(project: Path) -> None:
-    """Take all pictures."""
+    """Start Chromium and take all screenshots."""
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     if chromium is None:
         sys.exit("no chromium on PATH")

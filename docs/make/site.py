@@ -1,4 +1,4 @@
-"""Hook of mkdocs: pages that stand elsewhere in the repository join the site, and links to them lead there."""
+"""MkDocs hook that adds Markdown files from outside of docs to the site, and rewrites links to them."""
 
 import os
 import posixpath
@@ -22,20 +22,20 @@ LINK = re.compile(r"\]\(((?:\.\./)*)([\w./-]+\.md)(#[^)]*)?\)")
 
 
 def on_files(files, config):
-    """Add the pages, as they stand, to the files of the site."""
+    """Add the pages to the files of the site."""
     for source, target in PAGES.items():
         files.append(File.generated(config, target, content=(ROOT / source).read_text(encoding="utf-8")))
     return files
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Links of a page in ``docs`` to a page elsewhere lead to its place in the site."""
-    here = posixpath.dirname(page.file.src_uri)
+    """Rewrite links from a page in ``docs`` to a page elsewhere in the repository."""
+    folder = posixpath.dirname(page.file.src_uri)
 
-    def lead(match: re.Match) -> str:
-        path = posixpath.normpath(posixpath.join("docs", here, match[1] + match[2]))
+    def rewritten(match: re.Match) -> str:
+        path = posixpath.normpath(posixpath.join("docs", folder, match[1] + match[2]))
         if path not in PAGES:
             return match[0]
-        return f"]({os.path.relpath(PAGES[path], here or '.')}{match[3] or ''})"
+        return f"]({os.path.relpath(PAGES[path], folder or '.')}{match[3] or ''})"
 
-    return LINK.sub(lead, markdown)
+    return LINK.sub(rewritten, markdown)

@@ -166,7 +166,7 @@ def hand_inputs(
 
 
 def output_distances(hand: TrackedHand, distance_m: np.ndarray, settings: FeatureSettings) -> np.ndarray:
-    """Scale signed distances (frame, 22) of joints and tips (``SensorReadings.distance_m[:, 0]``) from the skin to [0, 1]."""
+    """Scale signed distances (frame, 22) of joints and tips (``distance_m[:, 0]``) from the skin to [0, 1]."""
     return np.clip((distance_m - hand.point_radius_m) / settings.range_m, 0.0, 1.0)
 
 

@@ -1,4 +1,4 @@
-"""``hoidata adapters`` and ``hoidata convert``: readers of datasets, listed, checked and run without a project."""
+"""``hoidata adapters`` and ``hoidata convert``: list, check and run dataset adapters without a project."""
 
 from collections import Counter
 from pathlib import Path
@@ -17,46 +17,58 @@ if TYPE_CHECKING:
     from hoidata.hands import HandPair
 
 app = typer.Typer(no_args_is_help=True)
-# Datasets whose sentences come from a list of verbs and objects, and the module with that list.
+# The module with the list of verbs and objects, for datasets whose sentences come from such a list.
 TEMPLATED = {"grab": "words", "h2o": "files", "arctic": "files"}
 COLOURS = {"pass": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
-Name = Annotated[str, typer.Argument(help="A name that `hoidata adapters list` shows.")]
-Root = Annotated[Path, typer.Option(help="A raw folder it can read.", exists=True, file_okay=False, resolve_path=True)]
-Sequences = Annotated[int, typer.Option(help="How many sequences to load, spread over those there are.", min=1)]
+Name = Annotated[str, typer.Argument(help="Name of an adapter, as `hoidata adapters list` shows it.")]
+Root = Annotated[Path, typer.Option(help="Folder with the raw files.", exists=True, file_okay=False, resolve_path=True)]
+Sequences = Annotated[int, typer.Option(help="Number of sequences to load, evenly spread.", min=1)]
 Hand = Annotated[
-    str, typer.Option(help="embedded, or the folder of the MANO files; by default those registered, if any.")
+    str,
+    typer.Option(
+        help="Hand model: embedded, or the folder of the MANO files. Default: the registered MANO files, else embedded."
+    ),
 ]
-Setting = Annotated[list[str] | None, typer.Option(help="One setting of the adapter, key=value; may be repeated.")]
-Strict = Annotated[bool, typer.Option("--strict", help="Warnings fail too.")]
-Out = Annotated[Path, typer.Option(help="The store to write; it must not be there yet.", resolve_path=True)]
-ConvertHand = Annotated[str, typer.Option(help="embedded, or the folder of the MANO files; by default HOIDATA_MANO.")]
-Jobs = Annotated[int, typer.Option(help="Worker processes; 0: one per core.", min=0)]
-Synthetic = Annotated[bool, typer.Option("--synthetic", help="The files were generated, and the store is to say so.")]
+Setting = Annotated[list[str] | None, typer.Option(help="A setting of the adapter, KEY=VALUE; can be repeated.")]
+Strict = Annotated[bool, typer.Option("--strict", help="Count warnings as failures.")]
+Out = Annotated[Path, typer.Option(help="Folder of the new store of clips; must not exist.", resolve_path=True)]
+ConvertHand = Annotated[
+    str,
+    typer.Option(
+        help="Hand model: embedded, or the folder of the MANO files. Default: HOIDATA_MANO, else registered files."
+    ),
+]
+Jobs = Annotated[int, typer.Option(help="Number of worker processes; 0 means one per core.", min=0)]
+Synthetic = Annotated[bool, typer.Option("--synthetic", help="Mark the store as synthetic, for generated files.")]
 
 
 @app.command("list")
 def list_adapters() -> None:
-    """All known adapters: dataset version, licence, where they come from, settings with their defaults."""
+    """List all adapters with dataset version, licence, origin, and settings with their defaults."""
     from hoidata.datasets.registry import registered_adapters
 
-    table = Table("name", "version", "licence", "may be shared", "from", show_lines=True)
+    table = Table(show_lines=True)
+    for head in ("name", "version", "licence", "may be shared", "from"):
+        table.add_column(head)
     table.add_column("settings", overflow="fold")
-    for row in registered_adapters():
-        if row.adapter is None:
-            table.add_row(row.name, "", f"[bold red]{escape(row.problem)}", "", escape(row.origin), "")
+    for entry in registered_adapters():
+        if entry.adapter is None:
+            table.add_row(entry.name, "", f"[bold red]{escape(entry.problem)}", "", escape(entry.origin), "")
             continue
-        facts, settings = row.adapter, "\n".join(f"{key}={value!r}" for key, value in row.settings.items())
+        facts, settings = entry.adapter, "\n".join(f"{key}={value!r}" for key, value in entry.settings.items())
         shared = "yes" if facts.may_be_shared else "no"
-        table.add_row(*map(escape, (row.name, facts.version, facts.licence, shared, row.origin, settings)))
+        table.add_row(*map(escape, (entry.name, facts.version, facts.licence, shared, entry.origin, settings)))
     Console().print(table)
 
 
 @app.command()
 def sentences(
-    names: Annotated[list[str] | None, typer.Argument(help="grab, h2o or arctic; all three by default.")] = None,
-    hand: Annotated[Literal["left", "right", "both"], typer.Option(help="The hand that the sentences name.")] = "right",
+    names: Annotated[
+        list[str] | None, typer.Argument(help="Datasets: grab, h2o or arctic. Default: all three.")
+    ] = None,
+    hand: Annotated[Literal["left", "right", "both"], typer.Option(help="Hand that the sentences name.")] = "right",
 ) -> None:
-    """Print the four sentences of every verb and object of GRAB, H2O and ARCTIC, as the stage annotate writes them."""
+    """Print the four sentences that the stage annotate writes for each verb and object of GRAB, H2O and ARCTIC."""
     from importlib import import_module
 
     from hoidata.annotation.sentences import four_sentences
@@ -66,8 +78,8 @@ def sentences(
             raise BadInput("hoidata adapters sentences", " or ".join(TEMPLATED), name, "choose one of them")
         pairs = import_module(f"hoidata.datasets.{name}.{TEMPLATED[name]}").PAIRS
         typer.echo(f"{name}: {len(pairs)} pairs of verb and object")
-        for verb, words in pairs:
-            typer.echo(f"  {verb}, {words}: {' '.join(four_sentences(verb, words, hand))}")
+        for verb, noun in pairs:
+            typer.echo(f"  {verb}, {noun}: {' '.join(four_sentences(verb, noun, hand))}")
 
 
 @app.command()
@@ -79,9 +91,9 @@ def check(
     setting: Setting = None,
     strict: Strict = False,
 ) -> None:
-    """Try every rule of an adapter on real input. Exit code 1 when one fails.
+    """Run the conformance checks of an adapter on raw files. The exit code is 1 if a check fails.
 
-    Nothing below ROOT is written to; altered copies are hard links in a temporary folder.
+    Files below ROOT are not changed; altered copies are in a temporary folder.
     """
     from hoidata.conformance.check import check_adapter
     from hoidata.datasets.registry import get_adapter
@@ -105,33 +117,35 @@ def convert(
     jobs: Jobs = 0,
     synthetic: Synthetic = False,
 ) -> None:
-    """Convert every sequence of a raw folder; what cannot be used is listed with its reason, in the store too.
+    """Convert all sequences of a raw folder to a store of clips, and list those that cannot be used.
 
-    A killed run goes on where it was. Corpora made by `hoidata synth` are known as such.
+    A killed run resumes. Corpora of `hoidata synth` are recognised and marked as synthetic.
     """
     from hoidata.conversion.convert import convert_dataset
     from hoidata.datasets.registry import get_adapter
-    from pipelines.stages.base import HAND, own_root
+    from pipelines.stages.base import HAND, registered_root
     from pipelines.stages.base import jobs as cores
 
     if out.exists():
-        raise BadInput(out, "a store that is not there yet", "something else", "choose another name, or remove it")
+        raise BadInput(
+            out, "a path that does not exist", "an existing file or folder", "choose another name, or remove it"
+        )
     adapter = get_adapter(name, **read_settings(setting or []))
     generated = synthetic or root.with_suffix(".recipe").is_file()
-    if adapter.needs_mano and not hand and not generated and own_root(HAND) is None:
+    if adapter.needs_mano and not hand and not generated and registered_root(HAND) is None:
         without_mano = getattr(adapter, "without_mano", "")
         raise MissingResource(
-            f"{name} holds MANO parameters; say where MANO_RIGHT.pkl and MANO_LEFT.pkl are: --hand FOLDER "
-            "(register at https://mano.is.tue.mpg.de)" + (f", or give --setting {without_mano}" if without_mano else "")
+            f"{name} has MANO parameters; name the folder of MANO_RIGHT.pkl and MANO_LEFT.pkl: --hand FOLDER "
+            "(register at https://mano.is.tue.mpg.de)" + (f", or use --setting {without_mano}" if without_mano else "")
         )
     hands = chosen_hands(hand or ("embedded" if generated else ""))
-    found = convert_dataset(adapter, root, hands, out, jobs or cores(), synthetic=generated)
+    summary = convert_dataset(adapter, root, hands, out, jobs or cores(), synthetic=generated)
     typer.echo(out)
-    raise typer.Exit(0 if found.clips else 1)
+    raise typer.Exit(0 if summary.clips else 1)
 
 
 def read_settings(pairs: list[str]) -> dict[str, Any]:
-    """``margin_frames=5`` as a number, other values as YAML reads them."""
+    """Settings from texts such as ``margin_frames=5``, with values parsed as YAML."""
     settings = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
@@ -145,18 +159,18 @@ def read_settings(pairs: list[str]) -> dict[str, Any]:
 
 
 def _hands(choice: str, needs_mano: bool) -> "tuple[HandPair, str]":
-    """The hand to check with, and what to say about it."""
+    """The hand model to check with, and a note for the table."""
     from hoidata.store.info import STAND_IN_ERROR
 
     hands = chosen_hands(choice)
     note = f"hand: {hands.name}"
     if needs_mano and hands.name == "embedded":
-        note += f"; on files made with MANO warnings about touch mean nothing: {STAND_IN_ERROR}"
+        note += f"; with files made for MANO, ignore warnings about touch: {STAND_IN_ERROR}"
     return hands, note
 
 
 def _print(name: str, findings, note: str) -> None:
-    table = Table("", "rule", "seen", title=f"adapter {name}", caption=note)
+    table = Table("", "rule", "result", title=f"adapter {name}", caption=note)
     for item in findings:
         table.add_row(f"[{COLOURS[item.outcome]}]{item.outcome}", escape(item.rule), escape(item.detail))
     counts = Counter(item.outcome for item in findings)

@@ -20,11 +20,14 @@ if TYPE_CHECKING:
     from pipelines.promises import Kept
 
 _FOLDER: Any = {"exists": True, "file_okay": False, "resolve_path": True}
-Store = Annotated[Path, typer.Argument(help="A store of predicted clips, <reference id>~<k>.", **_FOLDER)]
-Reference = Annotated[Path, typer.Option(help="An annotated dataset, such as data/embedded/grab.", **_FOLDER)]
+Store = Annotated[Path, typer.Argument(help="A store of predicted clips with ids <reference id>~<k>.", **_FOLDER)]
+Reference = Annotated[
+    Path, typer.Option(help="The annotated dataset with the recorded clips, such as data/embedded/grab.", **_FOLDER)
+]
 
 Metrics = Annotated[
-    Path, typer.Argument(help="Metrics of one dataset or more, such as metrics/study.", exists=True, file_okay=False)
+    Path,
+    typer.Argument(help="Folder with the metrics of datasets, such as metrics/study.", exists=True, file_okay=False),
 ]
 WORDS = {True: "yes", False: "NO", None: "not measured"}
 
@@ -32,14 +35,20 @@ WORDS = {True: "yes", False: "NO", None: "not measured"}
 def evaluate(
     store: Store,
     reference: Reference,
-    out: Annotated[Path | None, typer.Option(help="Also write the figures as JSON.", resolve_path=True)] = None,
-    evaluators: Annotated[
-        Path | None, typer.Option(help="Its trained evaluator, such as evaluators/study/grab.", exists=True)
+    out: Annotated[
+        Path | None, typer.Option(help="Also write the metrics to this JSON file.", resolve_path=True)
     ] = None,
-    split: Annotated[str, typer.Option(help="Part of the chosen split: train, validation or test.")] = "test",
-    metrics: Annotated[str, typer.Option(help="Further lists of metrics, comma between: bimart.")] = "",
+    evaluators: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the trained evaluators, such as evaluators/study/grab. Default: no metrics that need them.",
+            exists=True,
+        ),
+    ] = None,
+    split: Annotated[str, typer.Option(help="Subset of the chosen split: train, validation or test.")] = "test",
+    metrics: Annotated[str, typer.Option(help="Additional lists of metrics, separated by commas: bimart.")] = "",
 ) -> None:
-    """Measure every clip of a store against the clip it was made for, and print the table of metrics."""
+    """Compare the predicted clips of a store with the recorded clips they stand for, and print a table of metrics."""
     from hoidata.files import write_whole
     from hoidata.metrics.asked_metrics import with_lists
     from hoidata.metrics.evaluate import evaluate_store
@@ -51,17 +60,17 @@ def evaluate(
         from models.evaluator.encoders import load_evaluators
 
         encoders = load_evaluators(evaluators)
-    hands, asked = _hands(reference), with_lists(filter(None, metrics.split(",")))
-    found = evaluate_store(
-        store, reference, hands, split=split, metrics=asked, encoders=encoders, jobs=jobs(), progress=True
+    hands, chosen_metrics = _hands(reference), with_lists(filter(None, metrics.split(",")))
+    results = evaluate_store(
+        store, reference, hands, split=split, metrics=chosen_metrics, encoders=encoders, jobs=jobs(), progress=True
     )
-    Console(width=None if sys.stdout.isatty() else 120).print(printed_table(found))
-    for line in unmeasured_lines(found):
+    Console(width=None if sys.stdout.isatty() else 120).print(printed_table(results))
+    for line in unmeasured_lines(results):
         typer.echo(line)
-    for item in found["left_out"]:
-        typer.echo(f"left out: {item['clip_id']}: {item['reason']}")
+    for item in results["left_out"]:
+        typer.echo(f"skipped: {item['clip_id']}: {item['reason']}")
     if out is not None:
-        write_whole(out, json.dumps(found, indent=2, sort_keys=True, allow_nan=False) + "\n")
+        write_whole(out, json.dumps(results, indent=2, sort_keys=True, allow_nan=False) + "\n")
 
 
 def _hands(reference: Path) -> "HandPair":
@@ -69,15 +78,17 @@ def _hands(reference: Path) -> "HandPair":
     from hoidata.store.store import read_info
 
     with suppress(MissingResource):
-        enter_project()  # where the user's MANO files are noted
+        enter_project()  # its hoidata.toml names the user's MANO files
     return hands_of(read_info(reference / "clips")["hand_model"]["digest"], str(reference))
 
 
 def table(
-    folder: Annotated[Path, typer.Argument(help="Metrics of one dataset, such as metrics/study/grab.", exists=True)],
-    metrics: Annotated[str, typer.Option(help="Names, comma between, of hoidata/metrics/README.md.")],
+    folder: Annotated[
+        Path, typer.Argument(help="Folder with the metrics of one dataset, such as metrics/study/grab.", exists=True)
+    ],
+    metrics: Annotated[str, typer.Option(help="Names of metrics (hoidata/metrics/README.md), separated by commas.")],
 ) -> None:
-    """Figures of every family and control as Markdown; what loses to a training clip looked up says so."""
+    """Print metrics of all families and controls as a Markdown table, and mark those worse than retrieval."""
     from pipelines.pages.metrics_table import markdown_table
 
     families = sorted(path.stem for path in folder.glob("*.json"))
@@ -86,35 +97,38 @@ def table(
 
 def controls(
     folder: Metrics,
-    every: Annotated[bool, typer.Option("--all", help="Also list each that was not measured.")] = False,
+    list_all: Annotated[bool, typer.Option("--all", help="Also list comparisons that were not measured.")] = False,
 ) -> None:
-    """Check what every control must lose against the truth or a model; exit code 1 where one does not."""
+    """Check that each negative control has worse metrics than the recorded clips or a model.
+
+    The exit code is 1 if one has not.
+    """
     from pipelines.promises import datasets_below, kept, read_rows
 
     console, broken = Console(width=None if sys.stdout.isatty() else 160), 0
     for dataset in datasets_below(folder):
-        found = kept(read_rows(dataset))
-        console.print(_table(str(dataset), [item for item in found if every or item.holds is not None]))
-        counts = {holds: sum(item.holds is holds for item in found) for holds in WORDS}
+        results = kept(read_rows(dataset))
+        console.print(_table(str(dataset), [item for item in results if list_all or item.holds is not None]))
+        counts = {holds: sum(item.holds is holds for item in results) for holds in WORDS}
         typer.echo(f"{counts[True]} hold, {counts[False]} do not, {counts[None]} were not measured")
-        for why, count in sorted(Counter(item.why for item in found if item.holds is None).items()):
+        for why, count in sorted(Counter(item.why for item in results if item.holds is None).items()):
             typer.echo(f"  not measured: {count}: {why}")
         broken += counts[False]
     raise typer.Exit(bool(broken))
 
 
-def _table(title: str, found: "list[Kept]") -> "Table":
+def _table(title: str, results: "list[Kept]") -> "Table":
     from rich import box
     from rich.table import Table
 
     from pipelines.pages.metrics_table import number
 
-    table = Table("control", "metric", "beside", title=title, box=box.SIMPLE)
-    for name in ("figure there", "control"):
+    table = Table("control", "metric", "compared with", title=title, box=box.SIMPLE)
+    for name in ("its value", "control"):
         table.add_column(name, justify="right")
     table.add_column("must")
     table.add_column("holds")
-    for item in found:
-        promise, figures = item.promise, (number(item.reference), number(item.value))
-        table.add_row(promise.control, promise.metric, promise.beside, *figures, promise.must, WORDS[item.holds])
+    for item in results:
+        promise, values = item.promise, (number(item.reference), number(item.value))
+        table.add_row(promise.control, promise.metric, promise.beside, *values, promise.must, WORDS[item.holds])
     return table

@@ -1,4 +1,4 @@
-"""``hoidata export``: a store in the forms other projects read."""
+"""``hoidata export``: write a store in the formats of other projects."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,26 +9,32 @@ Data = Annotated[
     Path,
     typer.Argument(
         metavar="STORE",
-        help="A store of clips, or an annotated dataset such as data/embedded/grab: sentences and splits go along.",
+        help="A store of clips, or an annotated dataset such as data/embedded/grab, with sentences and splits.",
         exists=True,
         file_okay=False,
         resolve_path=True,
     ),
 ]
 To = Annotated[
-    str, typer.Option(help="croissant, lerobot, huggingface, webdataset, glb, usd, bvh or spider: docs/export.md.")
+    str,
+    typer.Option(help="Format: croissant, lerobot, huggingface, webdataset, glb, usd, bvh or spider (docs/export.md)."),
 ]
-Out = Annotated[Path, typer.Option(help="The folder to write; it must not be there yet.", resolve_path=True)]
-ClipIds = Annotated[list[str] | None, typer.Option("--clip", help="A clip's id, as often as wanted; all without it.")]
+Out = Annotated[Path, typer.Option(help="Output folder; must not exist.", resolve_path=True)]
+ClipIds = Annotated[
+    list[str] | None, typer.Option("--clip", help="Id of a clip to export; can be repeated. Default: all.")
+]
 OwnUse = Annotated[
-    bool, typer.Option("--for-own-use", help="Export what may not be passed on too; what is written says so.")
+    bool,
+    typer.Option(
+        "--for-own-use", help="Also export data that must not be shared; the output is marked as not to be shared."
+    ),
 ]
 
 
 def export(data: Data, to: To, out: Out, clip: ClipIds = None, for_own_use: OwnUse = False) -> None:
-    """Write the clips of a store as another project reads them, with licence per array.
+    """Write the clips of a store in the format of another project, with the licence of each array.
 
-    Refused where a licence forbids passing on what the format holds.
+    Refuses data that its licence forbids to share, unless --for-own-use is given.
     """
     from contextlib import suppress
 
@@ -40,9 +46,9 @@ def export(data: Data, to: To, out: Out, clip: ClipIds = None, for_own_use: OwnU
     folder = data if (data / "meta").is_dir() else data / "clips"
     info = read_info(folder)
     with suppress(MissingResource):
-        enter_project()  # where there is a project, it knows the user's MANO files
+        enter_project()  # the project's hoidata.toml names the user's MANO files
     hands = hands_of(info["hand_model"]["digest"], str(data))
     facts = export_store(open_store(folder, hands), to, out, tuple(clip or ()), for_own_use)
     for clip_id, reason in facts["left_out"].items():
-        typer.echo(f"left out {clip_id}: {reason}", err=True)
+        typer.echo(f"skipped {clip_id}: {reason}", err=True)
     typer.echo(out)

@@ -1,4 +1,4 @@
-"""``hoidata repro``, ``hoidata up`` and ``hoidata down``: the graph, by hand or through Prefect."""
+"""``hoidata repro``, ``hoidata up`` and ``hoidata down``: run the graph from the command line or with Prefect."""
 
 from typing import Annotated
 
@@ -8,11 +8,13 @@ from pipelines.commands.project import enter_project
 
 
 def repro(
-    targets: Annotated[list[str] | None, typer.Argument(help="Stages, e.g. annotate@embedded-arctic.")] = None,
-    jobs: Annotated[int, typer.Option(help="Stages at once; 0: one per core, at most 4.", min=0)] = 0,
-    force: Annotated[bool, typer.Option("--force", help="Run the targets even where nothing changed.")] = False,
+    targets: Annotated[
+        list[str] | None, typer.Argument(help="Stages to update, such as annotate@embedded-arctic. Default: all.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(help="Number of parallel stages; 0 means one per core, at most 4.", min=0)] = 0,
+    force: Annotated[bool, typer.Option("--force", help="Run the targets even if nothing has changed.")] = False,
 ) -> None:
-    """Check that the raw files a run needs are there, then bring the graph up to date, stages side by side."""
+    """Run all stages whose inputs have changed, in parallel; first check that the raw files exist."""
     enter_project()
     from pipelines.repro import reproduce
     from pipelines.side_by_side import describe_run
@@ -25,7 +27,8 @@ def repro(
 def up() -> None:
     """Start a Prefect server for this folder and serve the flows of its graph; Ctrl-C stops both.
 
-    They listen on this machine alone, and only to who can read .prefect/api-key: `prefect` typed here finds it itself.
+    The server listens on this machine only and requires the key in .prefect/api-key. The command `prefect` in this
+    folder reads the key itself.
     """
     enter_project()
     from pipelines.prefect_server import serve
@@ -34,7 +37,7 @@ def up() -> None:
 
 
 def down() -> None:
-    """Stop the server that `hoidata up` started for this folder, and what they run."""
+    """Stop the server that `hoidata up` started for this folder, and its runs."""
     enter_project()
     from pipelines.prefect_server import stop_running
 

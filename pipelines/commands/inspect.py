@@ -1,4 +1,4 @@
-"""``hoidata doctor``, ``info`` and ``validate``: what is here, and whether it is sound."""
+"""``hoidata doctor``, ``info`` and ``validate``: examine the installation, a store, or an output."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,26 +14,30 @@ SHOWN_ROWS = 12
 
 
 def doctor() -> None:
-    """Say what is installed and which raw folders, hand, encoder and GPU were found; exit code 1 if one is broken."""
+    """List installed packages, raw folders, hand models, text encoder and GPU; the exit code is 1 if one is broken."""
     enter_project()
     from pipelines.doctor import examine
 
     findings = examine()
-    table = Table("part", "state", "found")
+    table = Table("part", "state", "detail")
     colours = {"ok": "green", "absent": "yellow", "broken": "red"}
     for finding in findings:
-        table.add_row(finding.part, f"[{colours[finding.state]}]{finding.state}[/]", escape(finding.found))
+        table.add_row(finding.part, f"[{colours[finding.state]}]{finding.state}[/]", escape(finding.detail))
     Console().print(table)
     raise typer.Exit(1 if any(finding.state == "broken" for finding in findings) else 0)
 
 
 def info(
-    store: Annotated[Path, typer.Argument(help="A store of clips.", exists=True, file_okay=False, resolve_path=True)],
-    everything: Annotated[bool, typer.Option("--all", help="List all objects, verbs and what was left out.")] = False,
+    store: Annotated[
+        Path, typer.Argument(help="Folder of a store of clips.", exists=True, file_okay=False, resolve_path=True)
+    ],
+    everything: Annotated[
+        bool, typer.Option("--all", help="List all objects, verbs and quarantined sequences.")
+    ] = False,
 ) -> None:
-    """Describe a store: clips by object and verb, conventions, licence, and what was left out and why."""
+    """Describe a store: clips by object and verb, conventions, licence, and quarantined sequences with reasons."""
     from hoidata.store.store import open_store
-    from pipelines.commands.store_facts import fact_rows, group_rows, left_out_rows
+    from pipelines.commands.store_facts import fact_rows, group_rows, quarantine_rows
     from pipelines.stages.base import empty_reason
 
     if reason := empty_reason(store):
@@ -41,20 +45,21 @@ def info(
         return
     opened, console = open_store(store), Console()
     shown = None if everything else SHOWN_ROWS
-    _print_rows(console, ("what", "value"), fact_rows(opened), None)
+    _print_rows(console, ("property", "value"), fact_rows(opened), None)
     for column in ("object", "verb"):
         _print_rows(console, (column, "clips", "frames"), group_rows(opened, column), shown)
-    _print_rows(console, ("left out", "where", "expected", "got"), left_out_rows(opened), shown)
+    _print_rows(console, ("quarantined", "source", "expected", "got"), quarantine_rows(opened), shown)
 
 
 def validate(
     output: Annotated[
-        Path, typer.Argument(help="A store, a checkpoint, or whatever a stage wrote.", exists=True, resolve_path=True)
+        Path,
+        typer.Argument(help="A store, a checkpoint, or another output of a stage.", exists=True, resolve_path=True),
     ],
 ) -> None:
-    """Check that files are those that were written (dvc.lock, seals, checksums), and a store against the schema.
+    """Check that an output has not changed since it was written, and that a store fits the schema.
 
-    Exit code 1 when something is wrong.
+    Compares files with dvc.lock and checkpoints with their checksums. The exit code is 1 if there is a problem.
     """
     from pipelines.validation import problems_of
 
@@ -68,14 +73,14 @@ def validate(
 
 
 def _print_rows(console, heads: tuple[str, ...], rows: list[tuple[str, ...]], shown: int | None) -> None:
-    """A table with at most ``shown`` rows; says how many more there are."""
+    """Print a table with at most ``shown`` rows, and the number of omitted rows."""
     if not rows:
         return
     table = Table()
     for head in heads:
         table.add_column(head, justify="right" if head in ("clips", "frames") else "left", overflow="fold")
-    for row in rows[:shown]:
-        table.add_row(*map(escape, row))
+    for values in rows[:shown]:
+        table.add_row(*map(escape, values))
     console.print(table)
     if shown is not None and len(rows) > shown:
         console.print(f"and {len(rows) - shown:,} more (--all lists them)")

@@ -1,7 +1,6 @@
-"""``hoidata lineage``: what a file was made from, and ``diff``, ``uses``, ``check`` and ``rerun``.
+"""``hoidata lineage``: the inputs of a file; ``diff``, ``uses``, ``check`` and ``rerun``.
 
-``hoidata lineage TARGET`` needs no word before the target: only those four, as the first word, mean something else, and
-a file of such a name is ``./diff``.
+``hoidata lineage TARGET`` is short for ``hoidata lineage of TARGET``. A file named like a sub-command is ``./diff``.
 """
 
 import json as json_module
@@ -23,8 +22,8 @@ COLOURS = {"same": "green", "recorded": "cyan", "uncommitted": "yellow", "change
 FACTS = ("stage", "model", "config", "seed", "synthetic", "libraries", "clips", "params_digest", "code_digest")
 
 
-class _OfUnlessNamed(TyperGroup):
-    """Without one of its words the group means ``of``."""
+class _DefaultsToOf(TyperGroup):
+    """A command group that runs ``of`` if the first argument is not a sub-command."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if args and args[0] not in self.commands and args[0] not in ("--help", "-h"):
@@ -33,26 +32,31 @@ class _OfUnlessNamed(TyperGroup):
 
 
 app = typer.Typer(
-    cls=_OfUnlessNamed,
+    cls=_DefaultsToOf,
     no_args_is_help=True,
-    help="What a file was made from: hoidata lineage TARGET [--json|--mermaid|--prov|--page FILE|--raw]; "
-    "and what two differ in, what saw some data, whether all is whole, whether it can be made again.",
+    help="Show the inputs of a file: hoidata lineage TARGET [--json|--mermaid|--prov|--page FILE|--raw]. "
+    "Compare two files, list the uses of some data, verify all digests, or train a checkpoint again.",
 )
 
 
 @app.command(SHOW)
 def of(
-    target: Annotated[str, typer.Argument(help="A checkpoint, store, metric file or motion: its path, or a digest.")],
+    target: Annotated[
+        str, typer.Argument(help="A checkpoint, store, metric file or generated motion: its path, or its digest.")
+    ],
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a tree.")] = False,
     mermaid: Annotated[bool, typer.Option("--mermaid", help="Print a Mermaid flowchart.")] = False,
     prov: Annotated[bool, typer.Option("--prov", help="Print PROV-JSON.")] = False,
-    page: Annotated[Path | None, typer.Option(help="Write a page to click through.", resolve_path=True)] = None,
+    page: Annotated[Path | None, typer.Option(help="Write an HTML page to this file.", resolve_path=True)] = None,
     raw: Annotated[
-        bool, typer.Option("--raw", help="Every raw file and frame behind it, with digest, licence.")
+        bool, typer.Option("--raw", help="List the raw files and frames behind it, with digests and licences.")
     ] = False,
-    clips: Annotated[bool, typer.Option("--clips", help="List the ids of the clips it was trained on.")] = False,
+    clips: Annotated[bool, typer.Option("--clips", help="List all training and validation clips by id.")] = False,
 ) -> None:
-    """What a file was made from (no need to type ``of``). Exit code 0 when all is the same or only recorded, else 1."""
+    """Show all inputs of a file and whether they have changed; ``of`` can be omitted.
+
+    The exit code is 0 if all inputs are unchanged or cannot be compared, else 1.
+    """
     root, here = _project()
     from pipelines.lineage import formats
     from pipelines.lineage.raw import raw_sources
@@ -60,76 +64,90 @@ def of(
     from pipelines.lineage.tree import overall_status, target_tree
 
     if sum((json, mermaid, prov)) > 1:
-        raise BadInput("hoidata lineage", "one form", "several", "choose --json, --mermaid or --prov")
-    found = find_target(root, target, here)
-    tree, sources = target_tree(root, found), []
+        raise BadInput("hoidata lineage", "one format", "several", "choose --json, --mermaid or --prov")
+    file = find_target(root, target, here)
+    record, tree, sources = file.record, target_tree(root, file), []
     if raw or page:
-        sources = raw_sources(root, found.record) if found.kind != "motion" else _raw_of_motion(root, found.record)
+        sources = raw_sources(root, record) if file.kind != "motion" else _raw_of_motion(root, record)
     if page:
-        formats.write_lineage_page(page, tree, found.record, sources)
+        formats.write_lineage_page(page, tree, record, sources)
     if mermaid:
-        typer.echo(formats.mermaid(tree, found.record), nl=False)
+        typer.echo(formats.mermaid(tree, record), nl=False)
     elif json or prov:
-        values = formats.prov(tree, found.record) if prov else _json(tree, found.record, sources if raw else None)
+        values = formats.prov(tree, record) if prov else _json(tree, record, sources if raw else None)
         typer.echo(json_module.dumps(values, indent=2, ensure_ascii=False))
     elif raw:
         _print_raw(sources)
     else:
-        _print_tree(tree, found.record, clips)
+        _print_tree(tree, record, clips)
     raise typer.Exit(0 if overall_status(tree) in ("same", "recorded") else 1)
 
 
 @app.command()
 def diff(
-    first: Annotated[str, typer.Argument(help="A checkpoint, store or metric file: its path, or a digest.")],
-    second: Annotated[str, typer.Argument(help="Another one.")],
+    first: Annotated[str, typer.Argument(help="A checkpoint, store or metric file: its path, or its digest.")],
+    second: Annotated[str, typer.Argument(help="The file to compare it with: its path, or its digest.")],
 ) -> None:
-    """What made two differ: params, code, data, raw files, seed, libraries. Exit code 0 when nothing did, 1 else."""
+    """List the causes of a difference: params, code, data, raw files, seed, libraries.
+
+    The exit code is 0 if nothing differs, else 1.
+    """
     root, here = _project()
     from pipelines.lineage.diff import differences
     from pipelines.lineage.targets import find_target
 
-    targets = [find_target(root, words, here) for words in (first, second)]
+    targets = [find_target(root, name, here) for name in (first, second)]
     if any(target.kind == "motion" for target in targets):
         raise BadInput(
-            "hoidata lineage diff", "two checkpoints, stores or metric files", "a motion", "name its networks"
+            "hoidata lineage diff", "two checkpoints, stores or metric files", "a motion", "name its checkpoints"
         )
     if targets[0].is_of_lock != targets[1].is_of_lock:
-        raise BadInput("hoidata lineage diff", "two of a kind", "a checkpoint and something else", "name two of a kind")
-    found = differences(root, *(target.record for target in targets))
-    for line in found or ["nothing that is recorded differs"]:
+        raise BadInput(
+            "hoidata lineage diff", "two files of one kind", "a checkpoint and another file", "name two of one kind"
+        )
+    causes = differences(root, *(target.record for target in targets))
+    for line in causes or ["no recorded cause differs"]:
         typer.echo(line)
-    raise typer.Exit(1 if found else 0)
+    raise typer.Exit(1 if causes else 0)
 
 
 @app.command()
 def uses(
-    what: Annotated[str, typer.Argument(help="A raw file's path, a subject, an object or a clip.")],
+    source: Annotated[
+        str, typer.Argument(metavar="WHAT", help="The path of a raw file, a subject, an object, or a clip id.")
+    ],
     json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Every store, table, checkpoint, sample and metric that saw it: what must go when data is withdrawn."""
+    """List all outputs that use some data, and must be deleted if it is withdrawn.
+
+    Outputs are stores, tables, checkpoints, samples and metrics.
+    """
     root = enter_project()
     from pipelines.lineage.uses import uses as find_uses
 
-    found = find_uses(root, what)
+    outputs = find_uses(root, source)
     if json:
-        typer.echo(json_module.dumps([vars(use) for use in found], indent=2, ensure_ascii=False))
+        typer.echo(json_module.dumps([vars(use) for use in outputs], indent=2, ensure_ascii=False))
         return
-    for use in found:
+    for use in outputs:
         typer.echo(f"{use.kind} {use.name}: {use.why}")
 
 
 @app.command()
 def check(
-    target: Annotated[str, typer.Argument(help="Only what is behind this; everything when left out.")] = "",
+    target: Annotated[str, typer.Argument(help="Check only this file and its inputs. Default: all outputs.")] = "",
     against: Annotated[
-        Path | None, typer.Option(help="A table of a whole run, such as docs/digests/embedded.json.", resolve_path=True)
+        Path | None,
+        typer.Option(help="Compare with this digest table, such as docs/digests/embedded.json.", resolve_path=True),
     ] = None,
-    write: Annotated[Path | None, typer.Option(help="Write such a table of what is here.", resolve_path=True)] = None,
+    write: Annotated[
+        Path | None, typer.Option(help="Write a digest table of the profile's outputs to this file.", resolve_path=True)
+    ] = None,
 ) -> None:
-    """Hash everything again: outputs, seals of checkpoints, raw files. Exit code 0 when all is as it was written.
+    """Hash outputs, checkpoints and raw files again, and report those that have changed since they were written.
 
-    With --against: whether the data and networks here are those that somebody else's run made.
+    With --against, compare data and networks with those of another machine's run. The exit code is 0 if all are
+    unchanged, else 1.
     """
     here, root = Path.cwd(), enter_project()
     from pipelines.lineage.check import check as check_all
@@ -141,36 +159,39 @@ def check(
         nodes = compare_made(root, against)
     else:
         nodes = check_all(root, find_target(root, target, here) if target else None)
-    other = [node for node in nodes if node.status != "same"]
-    wrong = [node for node in other if node.status != "recorded"]
+    deviating = [node for node in nodes if node.status != "same"]
+    failed = [node for node in deviating if node.status != "recorded"]
     console = Console()
-    for node in other:
+    for node in deviating:
         console.print(_label(node), soft_wrap=True)
-    excused = f", {len(other) - len(wrong)} of another machine" * (len(other) > len(wrong))
-    console.print(f"{len(nodes)} looked at, {len(wrong)} not as they were written{excused}", highlight=False)
-    if write and not wrong:
+    excused = f", {len(deviating) - len(failed)} from another machine" * (len(deviating) > len(failed))
+    console.print(f"{len(nodes)} checked, {len(failed)} not as written{excused}", highlight=False)
+    if write and not failed:
         write_made(root, read_params(root)["profile"], write)
-    raise typer.Exit(1 if wrong else 0)
+    raise typer.Exit(1 if failed else 0)
 
 
 @app.command()
 def rerun(
     target: Annotated[str, typer.Argument(help="A checkpoint of this project.")],
-    commit: Annotated[str, typer.Option(help="Whose code and settings to train with.")] = "HEAD",
+    commit: Annotated[str, typer.Option(help="Git commit whose code and settings to train with.")] = "HEAD",
 ) -> None:
-    """Train a checkpoint again in a clean clone and compare its weights. Exit code 0 when they are the same bytes."""
+    """Train a checkpoint again in a clean clone and compare the weights.
+
+    The exit code is 0 if they have the same bytes, else 1.
+    """
     here, root = Path.cwd(), enter_project()
     from pipelines.lineage.rerun import rerun as train_again
     from pipelines.lineage.targets import find_target
 
     before, after = train_again(root, find_target(root, target, here), commit)
     same = before == after
-    typer.echo(f"payload sha256 {before}\ntrained again  {after}\n{'same' if same else 'other weights'}")
+    typer.echo(f"payload sha256 {before}\ntrained again  {after}\n{'same weights' if same else 'different weights'}")
     raise typer.Exit(0 if same else 1)
 
 
 def _project() -> tuple[Path | None, Path]:
-    """The project, entered, or None outside of any; and where the command was typed."""
+    """The project folder after changing into it (None outside of a project), and the folder before that."""
     here = Path.cwd()
     try:
         return enter_project(), here
@@ -198,7 +219,7 @@ def _json(tree, record: dict, sources: list | None) -> dict[str, Any]:
 
 
 def _print_raw(sources: list) -> None:
-    """One line per raw file, then one per clip with its frames in the source."""
+    """Print a line per raw file, then a line per clip with its frames in the source."""
     for source in sources:
         typer.echo(f"{source.store}: {len(source.digests)} files, {len(source.clips)} clips, licence {source.licence}")
         for path, digest in source.digests.items():
@@ -206,7 +227,7 @@ def _print_raw(sources: list) -> None:
         for clip in source.clips:
             typer.echo(f"  {clip.clip_id}  frames {clip.frames[0]}-{clip.frames[1]}  {' '.join(clip.files)}")
     if not sources:
-        typer.echo("no raw files are recorded, and there is no store here to ask")
+        typer.echo("no raw files are recorded, and the store is not here")
 
 
 def _print_tree(tree, record: dict, show_clips: bool) -> None:
@@ -214,9 +235,9 @@ def _print_tree(tree, record: dict, show_clips: bool) -> None:
 
     console, top = Console(), Tree(_label(tree))
     for child in tree.children:
-        _grow(top, child)
+        _add_branch(top, child)
     clips = {} if tree.kind == "motion" else record.get("clips", {})
-    branch = top.add("clips it was trained and judged on") if clips else top
+    branch = top.add("training and validation clips") if clips else top
     for split, ids in clips.items():
         names = branch.add(f"{split}: {len(ids)}")
         for clip_id in ids if show_clips else ids[:3]:
@@ -230,12 +251,12 @@ def _print_tree(tree, record: dict, show_clips: bool) -> None:
     console.print(f"status: {overall_status(tree)}", highlight=False)
 
 
-def _grow(parent, node) -> None:
-    """The node's children; of code only the files that are not as recorded."""
+def _add_branch(parent, node) -> None:
+    """Add a node with its children; of code only the files that have changed."""
     branch = parent.add(_label(node))
     for child in node.children:
         if node.kind != "code" or child.status not in ("same", "recorded"):
-            _grow(branch, child)
+            _add_branch(branch, child)
 
 
 def _label(node) -> str:

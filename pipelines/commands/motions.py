@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from math import isfinite
-from os.path import isfile  # of a name that is too long it says no, where a Path raises
+from os.path import isfile  # returns False for a name that is too long, where Path.is_file raises
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -11,42 +11,71 @@ import typer
 from pipelines.commands.project import current_profile, enter_project, hands_of
 
 if TYPE_CHECKING:
-    from pipelines.command_inputs import Written
+    from pipelines.command_inputs import WrittenFiles
     from pipelines.generation import Models
 
 Out = Annotated[
-    Path, typer.Option(help="Folder for motion.npz, motion.glb and index.html.", resolve_path=True, file_okay=False)
+    Path,
+    typer.Option(help="Output folder for motion.npz, motion.glb and index.html.", resolve_path=True, file_okay=False),
 ]
-Unit = Annotated[str, typer.Option(help="Of a mesh file: m, cm, mm, dm or inch; metres when left out.")]
-Up = Annotated[str, typer.Option(help="Axis of a mesh file that points up, like y or -z; found if left out.")]
-MeshHinge = Annotated[str, typer.Option(help="Of a two-piece mesh: 'px,py,pz dx,dy,dz', in the file's unit.")]
-Profile = Annotated[str, typer.Option(help="embedded, study or own; the one in params.yaml when left out.")]
+Unit = Annotated[str, typer.Option(help="Unit of a mesh file: m, cm, mm, dm or inch. Default: m.")]
+Up = Annotated[
+    str, typer.Option(help="Axis of a mesh file that points up, such as y or -z. Default: guessed from the mesh.")
+]
+MeshHinge = Annotated[
+    str,
+    typer.Option(
+        help="Hinge of a mesh with two pieces, 'px,py,pz dx,dy,dz': a point on the axis in the file's unit, and the "
+        "axis direction. Default: a rigid object."
+    ),
+]
+Profile = Annotated[str, typer.Option(help="Profile: embedded, study or own. Default: the one in params.yaml.")]
 
 
 def generate(
-    text: Annotated[str, typer.Argument(help="E.g. 'Lift a box with the right hand.'")],
-    object: Annotated[str, typer.Option("--object", help="A mesh file (OBJ, PLY, STL, GLB), or a dataset's object.")],
+    text: Annotated[str, typer.Argument(help="The sentence, such as 'Lift a box with the right hand.'")],
+    object: Annotated[
+        str,
+        typer.Option(
+            "--object", help="The object: a mesh file (OBJ, PLY, STL, GLB), or the name of a dataset's object."
+        ),
+    ],
     out: Out,
-    seed: Annotated[int, typer.Option(help="Same seed, same bytes.", min=0, max=2**63 - 1)] = 0,
-    samples: Annotated[int, typer.Option(help="How many motions, side by side.", min=1, max=32)] = 1,
-    hand: Annotated[Literal["left", "right", "both"] | None, typer.Option(help="Whatever the words say.")] = None,
-    length: Annotated[float | None, typer.Option(help="Seconds, instead of the length network's answer.")] = None,
+    seed: Annotated[
+        int, typer.Option(help="Random seed; the same seed gives the same bytes.", min=0, max=2**63 - 1)
+    ] = 0,
+    samples: Annotated[int, typer.Option(help="Number of motions to generate.", min=1, max=32)] = 1,
+    hand: Annotated[
+        Literal["left", "right", "both"] | None,
+        typer.Option(help="Hands that act. Default: derived from the sentence, see --hand-by."),
+    ] = None,
+    length: Annotated[
+        float | None, typer.Option(help="Duration in seconds. Default: the length network's prediction.")
+    ] = None,
     models: Annotated[
         Path | None,
         typer.Option(
-            help="Checkpoints of one dataset, such as checkpoints/embedded/grab: no project is needed.",
+            help="Folder with the checkpoints of one dataset, such as checkpoints/embedded/grab; works outside of a "
+            "project. Default: the project's checkpoints.",
             exists=True,
             file_okay=False,
         ),
     ] = None,
-    model: Annotated[str, typer.Option(help="Dataset whose models to use; else what knows the words.")] = "",
+    model: Annotated[
+        str,
+        typer.Option(help="Dataset whose models to use. Default: the one whose vocabulary fits the sentence best."),
+    ] = "",
     sampler: Annotated[
         Literal["ddim", "ddpm", "dpm++"] | None,
-        typer.Option(help="How noise becomes motion; else params.yaml's, ddim."),
+        typer.Option(help="Diffusion sampler. Default: the one in params.yaml, ddim as delivered."),
     ] = None,
-    steps: Annotated[int | None, typer.Option(help="Denoiser calls; else params.yaml's, 20.", min=1, max=1000)] = None,
+    steps: Annotated[
+        int | None,
+        typer.Option(help="Number of denoising steps. Default: from params.yaml, 20 as delivered.", min=1, max=1000),
+    ] = None,
     scale: Annotated[
-        float | None, typer.Option(help="Classifier-free guidance; 1 is none; else params.yaml's.")
+        float | None,
+        typer.Option(help="Classifier-free guidance scale; 1 means no guidance. Default: from params.yaml."),
     ] = None,
     unit: Unit = "",
     up: Up = "",
@@ -54,22 +83,24 @@ def generate(
     hand_by: Annotated[
         Literal["rules", "similarity"],
         typer.Option(
-            help="rules: what the words say; if they name hand and side as no rule knows, the similarity of text "
-            "features; else what is most common in training, named as such. "
-            "similarity: Text2HOI's own way, the most similar of three phrases, whatever the words say."
+            help="How to choose the hands without --hand. rules: grammar rules; for a phrase they do not cover, the "
+            "similarity of text features; for a sentence without a hand, the most frequent one in training. "
+            "similarity: Text2HOI's method, the most similar of three phrases."
         ),
     ] = "rules",
     profile: Profile = "",
     encoder: Annotated[
-        str, typer.Option(help="Of --models that read CLIP's features: clip:FILE.safetensors or clip:openai.")
+        str,
+        typer.Option(
+            help="Text encoder for --models that were trained with CLIP: clip:FILE.safetensors or clip:openai. "
+            "Default: the encoder that the checkpoints name."
+        ),
     ] = "",
-    force: Annotated[
-        bool, typer.Option("--force", help="Generate even where words of the sentence are unknown.")
-    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Generate even if the sentence has unknown words.")] = False,
 ) -> None:
-    """Text -> hands, length, contact, motion, refinement; writes arrays, an animated GLB and a page that plays it."""
+    """Generate hand-object motions for a sentence and an object; write arrays, an animated GLB and a web page."""
     mesh = Path(object).resolve() if isfile(object) else None
-    _refuse_what_is_not_asked(
+    _refuse_ineffective(
         {"--model": models and model, "--profile": models and profile, "--encoder": not models and encoder}
         | {"--hand-by": hand and hand_by != "rules"}
         | ({} if mesh or Path(object).suffix else {"--unit": unit, "--up": up, "--hinge": hinge})
@@ -78,47 +109,44 @@ def generate(
     from hoidata.clips.clip import FPS
     from hoidata.errors import BadInput
     from models.text2hoi.generation import Wish
-    from pipelines.command_inputs import MeshWish
-    from pipelines.generation import Asked, generate_files
+    from pipelines.command_inputs import MeshOptions
+    from pipelines.generation import GenerationRequest, generate_files
     from pipelines.params import read_params
 
-    where: dict[str, Any] = {"models": _given_models(models, encoder)} if models else {}
+    model_source: dict[str, Any] = {"models": _models_in(models, encoder)} if models else {}
     if root is not None:
-        where = {"profile": profile or current_profile(), "datasets": tuple(read_params(root)["datasets"])}
+        model_source = {"profile": profile or current_profile(), "datasets": tuple(read_params(root)["datasets"])}
     if length is not None and not isfinite(length * FPS):
-        raise BadInput("--length", "seconds", f"{length:g}", "leave it out for a length that the network chooses")
-    told = {"kind": sampler, "steps": steps, "guidance": scale}
-    wish = Wish(seed, samples, hand, None if length is None else round(length * FPS), hand_by)
-    written = generate_files(
-        Asked(
-            text,
-            mesh or object,
-            model=model,
-            wish=wish,
-            mesh=MeshWish(unit, up, hinge),
-            sampler={name: value for name, value in told.items() if value is not None},
-            force=force,
-            **where,
-        ),
-        out,
+        raise BadInput("--length", "seconds", f"{length:g}", "omit it for a length that the network predicts")
+    overrides = {"kind": sampler, "steps": steps, "guidance": scale}
+    frames = None if length is None else round(length * FPS)
+    request = GenerationRequest(
+        text,
+        mesh or object,
+        model=model,
+        wish=Wish(seed=seed, samples=samples, hand=hand, frames=frames, hand_by=hand_by),
+        mesh=MeshOptions(unit, up, hinge),
+        sampler={name: value for name, value in overrides.items() if value is not None},
+        force=force,
+        **model_source,
     )
-    _tell(written)
+    _print_written(generate_files(request, out))
 
 
-def _refuse_what_is_not_asked(given: Mapping[str, Any]) -> None:
-    """Raise BadInput for an option that would change nothing, in the place it was given."""
-    if idle := [name for name, value in given.items() if value]:
+def _refuse_ineffective(options: Mapping[str, Any]) -> None:
+    """Raise BadInput for options that are set but have no effect in this call."""
+    if ineffective := [name for name, value in options.items() if value]:
         from hoidata.errors import BadInput
 
         expected = (
             "--model and --profile in a project, --encoder with --models, --hand-by without --hand, --unit, --up and "
-            "--hinge with a mesh file that is there"
+            "--hinge with an existing mesh file"
         )
-        raise BadInput(", ".join(idle), expected, "an option that changes nothing here", "leave it out")
+        raise BadInput(", ".join(ineffective), expected, "an option that has no effect here", "omit it")
 
 
-def _given_models(folder: Path, encoder: str) -> "Models":
-    """Networks of a folder, with the hand and the text encoder their headers name, or the encoder that was told."""
+def _models_in(folder: Path, encoder: str) -> "Models":
+    """The networks in a folder, with the hand model and, unless given, the text encoder that their headers name."""
     from hoidata.annotation.encoders import load_encoder
     from models.common.checkpoints import FILE_NAME, read_info
     from pipelines.generation import Models
@@ -129,53 +157,87 @@ def _given_models(folder: Path, encoder: str) -> "Models":
 
 
 def animate(
-    what: Annotated[
+    source: Annotated[
         str,
         typer.Argument(
             metavar="TRAJECTORIES|CLIP",
-            help="A .csv, .npz or ManipNet .txt file (docs/fingers.md), or a clip's id.",
+            help="Trajectories of wrists and object in a .csv, .npz or ManipNet .txt file (docs/fingers.md), or the id "
+            "of a stored clip.",
         ),
     ],
     out: Out,
-    object: Annotated[str, typer.Option("--object", help="A mesh file (OBJ, PLY, STL, GLB) of the trajectories.")] = "",
-    fingers: Annotated[Literal["left", "right", "both"], typer.Option(help="Which hands.")] = "both",
-    frames: Annotated[str, typer.Option(help="Of a clip, like 30:90; all when left out.")] = "",
-    model: Annotated[str, typer.Option(help="Dataset whose network to use; the clip's own, or the first.")] = "",
-    rule: Annotated[Literal["ours", "paper", "off"], typer.Option(help="Of post-processing.")] = "ours",
+    object: Annotated[
+        str,
+        typer.Option(
+            "--object", help="The object of the trajectories: a mesh file (OBJ, PLY, STL, GLB) or a dataset's object."
+        ),
+    ] = "",
+    fingers: Annotated[Literal["left", "right", "both"], typer.Option(help="Hands to animate.")] = "both",
+    frames: Annotated[
+        str, typer.Option(help="Frames of a clip to replace, FIRST:STOP such as 30:90. Default: all.")
+    ] = "",
+    model: Annotated[
+        str,
+        typer.Option(help="Dataset whose network to use. Default: the clip's dataset, else the first with a network."),
+    ] = "",
+    rule: Annotated[
+        Literal["ours", "paper", "off"],
+        typer.Option(help="Post-processing of predicted fingers: ours, paper (as in ManipNet), or off."),
+    ] = "ours",
     trajectory_unit: Annotated[
-        str, typer.Option(help="Of positions in .csv and .npz: m, cm, mm, dm, inch; metres when left out.")
+        str, typer.Option(help="Unit of positions in .csv and .npz files: m, cm, mm, dm or inch. Default: m.")
     ] = "",
     wrist_axes: Annotated[
         Literal["model", "canonical"],
-        typer.Option(help="Of wrists in .csv and .npz: the hand model's, or x to the fingers, y to the thumb."),
+        typer.Option(
+            help="Wrist axes in .csv and .npz files: those of the hand model, or canonical (x to the fingers, y to the "
+            "thumb)."
+        ),
     ] = "model",
-    world_up: Annotated[str, typer.Option(help="Axis of the world that points up: x, y or z; only shown.")] = "",
+    world_up: Annotated[
+        str,
+        typer.Option(help="World axis that points up, x, y or z; affects the display only. Default: from the file."),
+    ] = "",
     unit: Annotated[
         str,
-        typer.Option(help="Of a mesh file: m, cm, mm, dm or inch; when left out metres, dm beside a ManipNet .txt."),
+        typer.Option(help="Unit of a mesh file: m, cm, mm, dm or inch. Default: m, or dm with a ManipNet .txt file."),
     ] = "",
     hinge: MeshHinge = "",
     way: Annotated[
         Literal["auto", "network", "interpolate"],
-        typer.Option(help="Frames of a clip; auto: interpolate up to 2 s between known poses, else the network."),
+        typer.Option(
+            help="How to fill frames of a clip. auto: interpolate gaps of up to 2 s between known poses, else use the "
+            "network."
+        ),
     ] = "auto",
     profile: Profile = "",
 ) -> None:
-    """Wrists and object stay as they are given; writes arrays, an animated GLB and a page that plays it."""
-    here = Path.cwd()
+    """Generate finger motion for given wrist and object trajectories; write arrays, an animated GLB and a web page."""
+    start_folder = Path.cwd()
     project = enter_project()
     from hoidata.clips.clip import SIDES
-    from pipelines.animation import AnimateWish, animate_files
-    from pipelines.command_inputs import MeshWish
+    from pipelines.animation import AnimationOptions, animate_files
+    from pipelines.command_inputs import MeshOptions
     from pipelines.params import read_params
 
-    paths = [str(here / name) if name and isfile(here / name) else name for name in (what, object)]
-    sides = SIDES if fingers == "both" else (fingers,)
-    wish = AnimateWish(
-        sides, frames, model, rule, paths[1], trajectory_unit, wrist_axes, world_up, MeshWish(unit, "", hinge), way
+    # Paths are relative to the folder in which the command was typed.
+    source, object = (
+        str(start_folder / name) if name and isfile(start_folder / name) else name for name in (source, object)
+    )
+    options = AnimationOptions(
+        sides=SIDES if fingers == "both" else (fingers,),
+        frames=frames,
+        model=model,
+        rule=rule,
+        object=object,
+        unit=trajectory_unit,
+        axes=wrist_axes,
+        up=world_up,
+        mesh=MeshOptions(unit, "", hinge),
+        method=way,
     )
     datasets = tuple(read_params(project)["datasets"])
-    for path in animate_files(paths[0], wish, profile or current_profile(), datasets, out):
+    for path in animate_files(source, options, profile or current_profile(), datasets, out):
         typer.echo(path)
 
 
@@ -183,49 +245,57 @@ def hands(
     out: Out,
     object: Annotated[
         str,
-        typer.Argument(metavar="[MESH]", help="A mesh file (OBJ, PLY, STL, GLB), or a dataset's object."),
+        typer.Argument(metavar="[MESH]", help="A mesh file (OBJ, PLY, STL, GLB), or the name of a dataset's object."),
     ] = "",
-    keyframes: Annotated[str, typer.Option(help="A .csv or .json file of times, places, turns and angles.")] = "",
-    clip: Annotated[str, typer.Option(help="A stored clip, whose object and motion are taken.")] = "",
-    motion: Annotated[
-        str, typer.Option(help="A motion.npz of `hoidata generate`, whose object's motion is taken.")
+    keyframes: Annotated[
+        str, typer.Option(help="The object's motion as keyframes: a .csv or .json file (docs/hands.md).")
     ] = "",
-    samples: Annotated[int, typer.Option(help="How many motions, side by side.", min=1, max=16)] = 1,
-    seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
-    hand: Annotated[Literal["left", "right", "both"], typer.Option(help="Which hands.")] = "both",
-    length: Annotated[float | None, typer.Option(help="Seconds it is to last, instead of its own time.")] = None,
+    clip: Annotated[str, typer.Option(help="Id of a stored clip whose object and motion to use.")] = "",
+    motion: Annotated[str, typer.Option(help="A motion.npz of `hoidata generate` whose object motion to use.")] = "",
+    samples: Annotated[int, typer.Option(help="Number of motions to generate.", min=1, max=16)] = 1,
+    seed: Annotated[int, typer.Option(help="Random seed; the same seed gives the same bytes.")] = 0,
+    hand: Annotated[Literal["left", "right", "both"], typer.Option(help="Hands that act.")] = "both",
+    length: Annotated[
+        float | None, typer.Option(help="Duration in seconds. Default: the duration of the object's motion.")
+    ] = None,
     unit: Unit = "",
     up: Up = "",
     hinge: MeshHinge = "",
-    hinge_range: Annotated[str, typer.Option(help="How far it opens, like 0:110 degrees; 0 is as drawn.")] = "",
-    model: Annotated[str, typer.Option(help="Dataset whose networks to use; else the first that has them.")] = "",
+    hinge_range: Annotated[
+        str,
+        typer.Option(
+            help="Lowest and highest hinge angle in degrees, such as 0:110; 0 is the mesh as stored. "
+            "Default: not limited, or as recorded for a dataset's object."
+        ),
+    ] = "",
+    model: Annotated[str, typer.Option(help="Dataset whose networks to use. Default: the first that has them.")] = "",
     profile: Profile = "",
 ) -> None:
-    """An object's motion -> contact maps, hands, refinement; writes arrays, animated GLBs and a page."""
-    here = Path.cwd()
+    """Generate hand motion for a given object motion; write arrays, an animated GLB per sample and a web page."""
+    start_folder = Path.cwd()
     project = enter_project()
-    from pipelines.command_inputs import MeshWish
-    from pipelines.hands import HandsWish, hands_files
+    from pipelines.command_inputs import MeshOptions
+    from pipelines.hands import HandsOptions, hands_files
     from pipelines.params import read_params
 
-    wish = HandsWish(
-        str(here / object) if object and isfile(here / object) else object,
-        str(here / keyframes) if keyframes else "",
-        clip,
-        str(here / motion) if motion else "",
-        MeshWish(unit, up, hinge),
-        hinge_range,
-        hand,
-        samples,
-        seed,
-        length,
-        model,
+    options = HandsOptions(
+        object=str(start_folder / object) if object and isfile(start_folder / object) else object,
+        keyframes=str(start_folder / keyframes) if keyframes else "",
+        clip=clip,
+        motion=str(start_folder / motion) if motion else "",
+        mesh=MeshOptions(unit, up, hinge),
+        hinge_range=hinge_range,
+        hand=hand,
+        samples=samples,
+        seed=seed,
+        length_s=length,
+        model=model,
     )
-    written = hands_files(wish, profile or current_profile(), tuple(read_params(project)["datasets"]), out)
-    _tell(written)
+    datasets = tuple(read_params(project)["datasets"])
+    _print_written(hands_files(options, profile or current_profile(), datasets, out))
 
 
-def _tell(written: "Written") -> None:
+def _print_written(written: "WrittenFiles") -> None:
     for note in written.notes:
         typer.echo(note, err=True)
     for path in written.paths:

@@ -1,4 +1,4 @@
-"""The project folder, its settings and the hand to compute with, as commands find them."""
+"""The project folder, its profile, and the hand model that a command uses."""
 
 import json
 import os
@@ -17,9 +17,9 @@ PROFILE = re.compile(r"^profile: *\S+", re.MULTILINE)
 
 
 def enter_project() -> Path:
-    """Make the project folder (the nearest one with dvc.yaml, from here upwards) the current folder; returns it.
+    """Change into the project folder, the nearest one with dvc.yaml at or above the current folder, and return it.
 
-    Raises MissingResource outside of any project.
+    Raises MissingResource outside of a project.
     """
     here = Path.cwd()
     for folder in (here, *here.parents):
@@ -32,12 +32,12 @@ def enter_project() -> Path:
 
 
 def current_profile() -> str:
-    """The profile params.yaml chooses."""
+    """The profile that params.yaml chooses."""
     return read_params(Path())["profile"]
 
 
 def set_profile(profile: str) -> bool:
-    """Set the profile in params.yaml, a change that git and DVC see as any other; False when it said so already."""
+    """Set the profile in params.yaml. Returns False if it was set already."""
     path = Path("params.yaml")
     if current_profile() == profile:
         return False
@@ -49,7 +49,7 @@ def set_profile(profile: str) -> bool:
 
 
 def remember_root(name: str, root: Path) -> None:
-    """Note a raw folder in hoidata.toml, which version control ignores; its other sections stay."""
+    """Register a raw folder in hoidata.toml, which git ignores; other sections stay unchanged."""
     path = Path("hoidata.toml")
     text = path.read_text() if path.is_file() else ""
     settings = tomllib.loads(text)
@@ -61,24 +61,29 @@ def remember_root(name: str, root: Path) -> None:
 
 
 def chosen_hands(choice: str) -> "HandPair":
-    """``embedded``, or the folder of MANO's files; for nothing those that are registered, else the embedded one."""
+    """The hand model for "embedded", for a folder of MANO files, or for "": registered MANO files, else embedded."""
     from hoidata.hands import load_embedded_hands, load_mano_hands
-    from pipelines.stages.base import HAND, own_root
+    from pipelines.stages.base import HAND, registered_root
 
-    folder = Path(choice) if choice not in ("", "embedded") else (own_root(HAND) if not choice else None)
+    folder = Path(choice) if choice not in ("", "embedded") else (registered_root(HAND) if not choice else None)
     return load_embedded_hands() if folder is None else load_mano_hands(folder)
 
 
-def hands_of(digest: str, what: str) -> "HandPair":
-    """The hand of a digest that ``what`` was made with: the embedded one, or the user's MANO files.
+def hands_of(digest: str, source: str) -> "HandPair":
+    """The hand model with a digest: the embedded one, or the user's MANO files.
 
-    Raises MissingResource where it is neither.
+    Args:
+        digest: of the hand model that ``source`` was made with.
+        source: a store or folder of checkpoints, for the error message.
+
+    Raises:
+        MissingResource: neither has this digest.
     """
-    each = (chosen_hands(choice) for choice in ("embedded", ""))  # the second is not looked for where the first fits
-    found = next((hands for hands in each if hands.digest == digest), None)
-    if found is None:
+    candidates = (chosen_hands(choice) for choice in ("embedded", ""))  # MANO files are read only if needed
+    matching = next((hands for hands in candidates if hands.digest == digest), None)
+    if matching is None:
         raise MissingResource(
-            f"{what} was made with a hand ({digest[:12]}) that is not here; name the folder of the MANO files in "
+            f"{source} was made with a hand ({digest[:12]}) that is not here; name the folder of the MANO files in "
             "HOIDATA_MANO, or register it in a project: `hoidata raw scan mano --root FOLDER`"
         )
-    return found
+    return matching

@@ -1,4 +1,4 @@
-"""``hoidata raw``: the user's own raw files."""
+"""``hoidata raw`` and ``hoidata profile``: the user's raw files, and the choice of the data to work on."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +10,7 @@ from pipelines.commands.project import current_profile, enter_project, remember_
 from pipelines.params import PROFILES, read_params
 
 app = typer.Typer(no_args_is_help=True)
-Dataset = Annotated[str, typer.Argument(help="A dataset of params.yaml, or `mano` for the hand files.")]
+Dataset = Annotated[str, typer.Argument(help="A dataset of params.yaml, or mano for the MANO files.")]
 SHOWN_DIFFERENCES = 50
 MANO_FILES = ("MANO_RIGHT.pkl", "MANO_LEFT.pkl")
 
@@ -18,9 +18,11 @@ MANO_FILES = ("MANO_RIGHT.pkl", "MANO_LEFT.pkl")
 @app.command()
 def scan(
     dataset: Dataset,
-    root: Annotated[Path, typer.Option(help="Its raw folder.", exists=True, file_okay=False, resolve_path=True)],
+    root: Annotated[
+        Path, typer.Option(help="Folder with the raw files.", exists=True, file_okay=False, resolve_path=True)
+    ],
 ) -> None:
-    """Write the manifest of your copy of a dataset, remember where it lies, and switch to the profile `own`."""
+    """Write the manifest of your raw files of a dataset, register their folder, and switch to the profile own."""
     enter_project()
     from pipelines.lineage.manifests import write_manifest
     from pipelines.stages.adapters import ensure_manifests, source_of
@@ -29,9 +31,9 @@ def scan(
     name = HAND if dataset == "mano" else dataset
     paths = StagePaths("own", name)
     manifest = _scan_hand(paths, root) if name == HAND else _scan_dataset(paths, root)
-    known = read_params(Path())["datasets"]
-    ensure_manifests("own", known)
-    for variant in (name, *(other for other in known if other != name and source_of(other) == name)):
+    datasets = read_params(Path())["datasets"]
+    ensure_manifests("own", datasets)
+    for variant in (name, *(other for other in datasets if other != name and source_of(other) == name)):
         write_manifest(StagePaths("own", variant).manifest, manifest)
     remember_root(name, root)
     size = sum(entry.size for entry in manifest.files)
@@ -40,15 +42,15 @@ def scan(
         return
     typer.echo(f"{manifest.dataset} {manifest.version}: {manifest.licence}")
     if not manifest.may_be_shared:
-        typer.echo("What is made from it stays on this machine: `dvc push` leaves it out (see `hoidata share --help`)")
+        typer.echo("Data derived from it stays on this machine: `dvc push` skips it (see `hoidata share --help`)")
     if set_profile("own"):
         typer.echo("params.yaml: profile set to own (`hoidata profile embedded` returns; nothing is retrained)")
 
 
 def profile(
-    name: Annotated[str, typer.Argument(help="embedded, study or own; nothing: say which one it is.")] = "",
+    name: Annotated[str, typer.Argument(help="embedded, study or own. Default: print the current one.")] = "",
 ) -> None:
-    """Say which data the project works on, or choose it: the line `profile` of params.yaml, which git and DVC see."""
+    """Print or choose the profile, the data that the project works on; it is the line profile of params.yaml."""
     enter_project()
     if name and name not in PROFILES:
         raise BadInput("hoidata profile", " or ".join(PROFILES), name, "choose one of them")
@@ -62,12 +64,12 @@ def _scan_dataset(paths, root: Path):
     from pipelines.stages.adapters import configured_adapter
     from pipelines.stages.raw import require_hand
 
-    known = read_params(Path())["datasets"]
+    datasets = read_params(Path())["datasets"]
     adapter = configured_adapter(paths.dataset)
-    if paths.dataset not in known:
+    if paths.dataset not in datasets:
         remedy = f"add {paths.dataset} to `datasets` in params.yaml"
-        raise BadInput("params.yaml: datasets", paths.dataset, f"only {', '.join(known)}", remedy)
-    # First what was asked about, then what it needs besides.
+        raise BadInput("params.yaml: datasets", paths.dataset, f"only {', '.join(datasets)}", remedy)
+    # A problem of the folder is reported before a missing hand model.
     try:
         require_hand(paths)
     except MissingResource as error:
@@ -78,26 +80,29 @@ def _scan_dataset(paths, root: Path):
 
 
 def _require_parts(adapter, root: Path, also: str = "") -> None:
-    """Refuse a folder in which a required part is missing; name optional ones. Both with where to get them.
+    """Raise BadInput if the folder lacks a required part; print missing optional parts. Both with their download page.
 
-    also: another problem to name behind that of the folder.
+    Args:
+        adapter: of the dataset.
+        root: the raw folder.
+        also: another problem to add to the message.
     """
     from pipelines.lineage.manifests import missing_parts
 
     missing = missing_parts(adapter, root)
     required = [part for part in missing if not part.optional]
     if required or not adapter.sequences(root):
-        what = "; ".join(f"{part.contents} ({part.patterns[0]}, from {part.archive})" for part in required)
-        got = f"no {what}" if what else "none"
-        remedy = f"give the folder that {adapter.name} unpacks to; register at {adapter.where_to_register}"
+        parts = "; ".join(f"{part.contents} ({part.patterns[0]}, from {part.archive})" for part in required)
+        got = f"no {parts}" if parts else "none"
+        remedy = f"name the folder that {adapter.name} unpacks to; register at {adapter.where_to_register}"
         if settings := {part.unneeded_with for part in required if part.unneeded_with}:
             key, _, value = ", ".join(sorted(settings)).partition("=")
             remedy += f"; or set `{adapter.name}: {{{key}: {value}}}` under `convert.adapters` in params.yaml, "
-            remedy += "which does without"
-        remedy += f". Besides, {also}" if also else ""
+            remedy += "which does not need it"
+        remedy += f". Also, {also}" if also else ""
         raise BadInput(root, f"sequences of {adapter.name}", got, remedy)
     for part in missing:
-        typer.echo(f"{adapter.name}: without {part.contents} ({part.patterns[0]}), to be had from {part.archive}")
+        typer.echo(f"{adapter.name}: without {part.contents} ({part.patterns[0]}), available from {part.archive}")
 
 
 def _scan_hand(paths, root: Path):
@@ -113,18 +118,20 @@ def _scan_hand(paths, root: Path):
 
 
 @app.command()
-def verify(dataset: Annotated[str, typer.Argument(help="A dataset; all that are present when left out.")] = "") -> None:
-    """Compare raw files with the manifests of the current profile. Exit code 1 when they differ or are not there."""
+def verify(dataset: Annotated[str, typer.Argument(help="A dataset. Default: all that are present.")] = "") -> None:
+    """Compare raw files with the manifests of the current profile; the exit code is 1 if they differ or are missing."""
     enter_project()
     names = [dataset] if dataset else read_params(Path())["datasets"]
-    results = [_verify_one(name, asked_for=bool(dataset)) for name in names]
+    results = [_verify_one(name, is_required=bool(dataset)) for name in names]
     raise typer.Exit(0 if all(results) else 1)
 
 
-def _verify_one(dataset: str, asked_for: bool) -> bool:
-    """Print how one dataset's files compare with its manifest; True when there is nothing to complain about.
+def _verify_one(dataset: str, is_required: bool) -> bool:
+    """Print the differences of one dataset's files from its manifest. Returns whether they agree.
 
-    asked_for: by name, so that its absence is a complaint.
+    Args:
+        dataset: the dataset.
+        is_required: whether its absence is a problem.
     """
     from pipelines.lineage.manifests import read_manifest, verify_files
     from pipelines.stages.adapters import configured_adapter, manifest_of, raw_files
@@ -134,13 +141,13 @@ def _verify_one(dataset: str, asked_for: bool) -> bool:
     manifest = manifest_of(paths)
     if not manifest.present:
         typer.echo(f"{dataset}: not present in the profile {paths.profile}: no raw files were scanned")
-        _say_where_to_get(adapter)
-        return not asked_for
+        _print_sources(adapter)
+        return not is_required
     try:
         root = raw_files(paths)
     except MissingResource as error:
         typer.echo(f"{dataset}: {error}")
-        _say_where_to_get(adapter)
+        _print_sources(adapter)
         return False
     listed = read_manifest(paths.raw_manifest) if manifest.synthetic else manifest
     differences = verify_files(root, listed, adapter.parts)
@@ -152,8 +159,8 @@ def _verify_one(dataset: str, asked_for: bool) -> bool:
     return not differences
 
 
-def _say_where_to_get(adapter) -> None:
-    """The parts a copy consists of and where each is to be had, the licence, and what to do once they are here."""
+def _print_sources(adapter) -> None:
+    """Print the licence, the parts of a dataset with their download pages, and the next command."""
     typer.echo(f"  {adapter.licence}; {adapter.where_to_register}")
     for part in adapter.parts:
         optional = " (optional)" if part.optional else ""

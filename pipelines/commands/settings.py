@@ -1,4 +1,4 @@
-"""``hoidata settings``: every setting a stage takes from params.yaml, with what it is set to."""
+"""``hoidata settings``: the settings of all data stages, with defaults."""
 
 from importlib import import_module
 from typing import Annotated, Any
@@ -8,7 +8,7 @@ import yaml
 
 from pipelines.commands.project import enter_project
 
-# The class that holds names, types and defaults of a section.
+# The dataclass with names, types and defaults of each section.
 SECTIONS = {
     "convert": "pipelines.stages.adapters:ConvertSettings",
     "quality": "hoidata.quality.thresholds:Thresholds",
@@ -20,16 +20,16 @@ SECTIONS = {
 }
 
 
-def settings(section: Annotated[str, typer.Argument(help="One section; all when left out.")] = "") -> None:
-    """Print all settings of the data stages as they are now, defaults included, in the form of params.yaml."""
+def settings(section: Annotated[str, typer.Argument(help="One section of params.yaml. Default: all.")] = "") -> None:
+    """Print the current settings of the data stages, including defaults, in the format of params.yaml."""
     enter_project()
     from hoidata.settings import plain_config, refuse_unknown
     from pipelines.stages.base import load_settings
 
     refuse_unknown({section: None} if section else {}, list(SECTIONS), "hoidata settings")
     names = [section] if section else list(SECTIONS)
-    found = {name: plain_config(load_settings(settings_class(name), name)) for name in names}
-    typer.echo(yaml.safe_dump(found, sort_keys=False, width=120), nl=False)
+    values = {name: plain_config(load_settings(settings_class(name), name)) for name in names}
+    typer.echo(yaml.safe_dump(values, sort_keys=False, width=120), nl=False)
 
 
 def settings_class(section: str) -> Any:

@@ -1,8 +1,8 @@
-"""``hoidata share``: whether ``dvc push`` sends what was made from the data.
+"""``hoidata share``: whether ``dvc push`` sends data derived from the raw files.
 
-Derived outputs have an address of their own, a folder beside the other files of the shared remote. DVC keeps an index
-of what belongs to an address and does not notice when an output gets another remote with the same address; so no
-address may ever hold derived outputs at one time and only the others at another.
+Derived outputs have a separate address: a folder in the shared remote, next to its other files. DVC keeps an index per
+address, and does not notice when an output moves to another remote with the same address. So an address must either
+always or never have derived outputs.
 """
 
 from pathlib import Path
@@ -14,27 +14,29 @@ from hoidata.errors import MissingResource
 from pipelines.commands.project import current_profile, enter_project
 from pipelines.params import read_params
 
-# The remote of all derived outputs: by .dvc/config the cache they are stored in, so that nothing is sent. Also the name
-# of their folder on a shared remote.
+# The remote of all derived outputs. In .dvc/config it is the local cache, so that nothing is sent. Also the name of
+# their folder on a shared remote.
 DERIVED = "derived"
 
 
 def share(
-    on: Annotated[bool, typer.Option("--on/--off", help="Let `dvc push` send it and `dvc pull` fetch it, or not.")],
+    on: Annotated[
+        bool, typer.Option("--on/--off", help="Whether `dvc push` sends derived data and `dvc pull` fetches it.")
+    ],
 ) -> None:
-    """Let `dvc push` send clips and everything made from them, or keep them on this machine (as delivered).
+    """Choose whether `dvc push` sends clips and data derived from them, or keeps them on this machine (the default).
 
-    The choice holds for this copy of the project; a clone needs `--on` too before `dvc pull` fetches them. Most of
-    these datasets forbid passing on what is derived from them. Whether you may is yours to know.
+    The choice is stored in this copy of the project only; a clone needs `--on` before `dvc pull` fetches the data. Most
+    of these datasets forbid sharing derived data. You are responsible for keeping their licences.
     """
     enter_project()
     for line in _terms() if on else ():
         typer.echo(line)
-    typer.echo(f".dvc/config.local: what is derived from data {f'goes to {_lead_out()}' if on else _keep_here()}")
+    typer.echo(f".dvc/config.local: derived data {f'goes to {_share_derived()}' if on else _keep_derived()}")
 
 
-def _lead_out() -> str:
-    """Give derived outputs a folder of the project's default remote, with all its options; returns the address."""
+def _share_derived() -> str:
+    """Set the remote of derived outputs to a folder of the project's default remote. Returns its address."""
     config = _config()
     name = config["core"].get("remote")
     if name is None:
@@ -46,7 +48,7 @@ def _lead_out() -> str:
     return address
 
 
-def _keep_here() -> str:
+def _keep_derived() -> str:
     with _config().edit("local") as local:
         local["remote"].pop(DERIVED, None)
     return "stays here"
@@ -59,10 +61,10 @@ def _config() -> Any:
 
 
 def _terms() -> list[str]:
-    """One line per dataset of the current profile whose licence does not let derived data be passed on."""
+    """One line per dataset of the current profile whose licence forbids sharing derived data."""
     from pipelines.stages.adapters import manifest_of
     from pipelines.stages.base import StagePaths
 
     runs = [StagePaths(current_profile(), name) for name in read_params(Path())["datasets"]]
-    bound = [manifest for paths in runs if (manifest := manifest_of(paths)).present]
-    return [f"{item.dataset}: {item.licence}" for item in bound if not item.may_be_shared]
+    manifests = [manifest_of(paths) for paths in runs]
+    return [f"{item.dataset}: {item.licence}" for item in manifests if item.present and not item.may_be_shared]

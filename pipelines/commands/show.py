@@ -1,4 +1,4 @@
-"""``hoidata show``: one clip, or one dataset, as a page to look at."""
+"""``hoidata show``: a web page about one clip or one dataset."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -12,7 +12,7 @@ from pipelines.commands.project import current_profile, enter_project, hands_of
 Data = Annotated[
     Path | None,
     typer.Option(
-        help="An annotated dataset, such as data/embedded/grab, or a store, in place of those of a project.",
+        help="An annotated dataset such as data/embedded/grab, or a store. Default: the datasets of the project.",
         exists=True,
         file_okay=False,
         resolve_path=True,
@@ -21,22 +21,22 @@ Data = Annotated[
 
 
 def show(
-    what: Annotated[str, typer.Argument(metavar="[CLIP]", help="A clip's id, or a dataset's name.")] = "",
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for the page; .hoidata/pages when left out.", resolve_path=True)
-    ] = None,
+    clip_or_dataset: Annotated[str, typer.Argument(metavar="[CLIP]", help="Id of a clip, or name of a dataset.")] = "",
+    out: Annotated[Path | None, typer.Option(help="Output folder. Default: .hoidata/pages.", resolve_path=True)] = None,
     open_page: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False,
-    profile: Annotated[str, typer.Option(help="embedded, study or own; the one in params.yaml when left out.")] = "",
+    profile: Annotated[
+        str, typer.Option(help="Profile: embedded, study or own. Default: the one in params.yaml.")
+    ] = "",
     data: Data = None,
 ) -> None:
-    """Write a self-contained page of a clip (motion, contact, curves, words, evidence, origin) or of a dataset."""
+    """Write a self-contained web page about a clip (motion, contact, curves, sentences, origin) or a dataset."""
     if data is not None:
-        path = _of_folder(data, what, out or Path.cwd())
-    elif what:
+        path = _write_page_of(data, clip_or_dataset, out or Path.cwd())
+    elif clip_or_dataset:
         project = enter_project()
         from pipelines.showing import write_shown
 
-        path = write_shown(what, profile or current_profile(), out or project / ".hoidata" / "pages")
+        path = write_shown(clip_or_dataset, profile or current_profile(), out or project / ".hoidata" / "pages")
     else:
         raise BadInput("hoidata show", "a clip's id, a dataset's name, or --data FOLDER", "none", "name one")
     typer.echo(path)
@@ -44,8 +44,8 @@ def show(
         typer.launch(path.resolve().as_uri())
 
 
-def _of_folder(data: Path, clip_id: str, out: Path) -> Path:
-    """No project is needed; where there is one, it knows the user's MANO files."""
+def _write_page_of(data: Path, clip_id: str, out: Path) -> Path:
+    """Write the page of a clip in a folder; in a project, hoidata.toml names the user's MANO files."""
     from hoidata.store.store import read_info
     from pipelines.showing import write_shown_of
 

@@ -1,4 +1,4 @@
-"""``hoidata synth``: the corpora of the profiles embedded and study."""
+"""``hoidata synth``: the generated corpora of the profiles embedded and study."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,13 +10,13 @@ from hoidata.errors import BadInput, MissingResource
 from pipelines.commands.project import enter_project
 
 app = typer.Typer(no_args_is_help=True)
-Dataset = Annotated[str, typer.Argument(help="h2o, grab or arctic; all the profile has when left out.")]
-Profile = Annotated[str, typer.Option(help="embedded or study.")]
+Dataset = Annotated[str, typer.Argument(help="h2o, grab or arctic. Default: all corpora of the profile.")]
+Profile = Annotated[str, typer.Option(help="Profile: embedded or study.")]
 
 
 @app.command()
 def write(dataset: Dataset = "", profile: Profile = "embedded") -> None:
-    """Write the raw trees of a profile's corpora anew, as their committed recipes say."""
+    """Write the raw files of a profile's corpora again, from their committed recipes."""
     enter_project()
     from pipelines.lineage.manifests import read_manifest
     from pipelines.stages.base import StagePaths
@@ -30,12 +30,15 @@ def write(dataset: Dataset = "", profile: Profile = "embedded") -> None:
 
 @app.command()
 def check(
-    size: Annotated[str, typer.Option(help="full or small: of embedded; study or study-small.")] = "full",
-    seed: Annotated[int, typer.Option(help="Seed of the corpora.")] = 0,
+    size: Annotated[
+        str, typer.Option(help="Corpus to generate: full or small (embedded), study or study-small (study).")
+    ] = "full",
+    seed: Annotated[int, typer.Option(help="Random seed of the corpora.")] = 0,
 ) -> None:
-    """Make the corpora anew and measure them: contact forces, distances, penetration, controls. Exit code 1 if unsound.
+    """Generate the corpora and measure contact forces, distances, penetration and controls.
 
-    Sound: at least 98 % of held frames pass, hands stay within 20 mm of the object and less than 10 mm inside it.
+    The exit code is 0 if forces explain at least 98 % of the grasped frames, hands stay within 20 mm of the object, and
+    penetrate it by less than 10 mm. Else it is 1.
     """
     import numpy as np
 
@@ -45,12 +48,12 @@ def check(
 
     if size not in SIZES:
         raise BadInput("--size", " or ".join(SIZES), size, "correct it")
-    figures = check_corpus(size, seed, jobs())
-    Console().print(as_text(figures))
+    measures = check_corpus(size, seed, jobs())
+    Console().print(as_text(measures))
     sound = np.asarray(
-        (figures["pass %"] >= 98)
-        & (figures["largest hand-object distance mm"] < 20)
-        & (figures["largest penetration mm"] < 10)
+        (measures["pass %"] >= 98)
+        & (measures["largest hand-object distance mm"] < 20)
+        & (measures["largest penetration mm"] < 10)
     )
     raise typer.Exit(0 if sound.all() else 1)
 

@@ -1,1 +1,1 @@
-"""Stores in the forms other projects read, each with the licences of its arrays (``hoidata export``)."""
+"""`hoidata export`: stores in the formats of other projects, with the licence of each array."""

@@ -1,9 +1,8 @@
-"""BVH for animators: per clip one skeleton of 21 joints for each hand, and one of the object, in metres, y up.
+"""BVH for animators: per clip a skeleton of 21 joints for each hand, and one for the object, in metres, y up.
 
-BVH states no axes. Blender and Maya take y for up, so the world is turned until gravity is -y. A BVH file has no
-place for other facts: ``clip.json`` says which frames repeat a hand's pose. All joints have six channels, position
-(which takes the place of OFFSET) and rotation, so that fingers whose length changes and tips that the skin moves are
-where the clip has them.
+BVH does not state axes. Blender and Maya assume y up, so the world is rotated until gravity is -y. A BVH file has no
+field for other facts: ``clip.json`` lists the frames that repeat a hand's pose. All joints have six channels, because
+bone lengths change and fingertips move with the skin: position, which replaces OFFSET, and rotation.
 """
 
 import warnings
@@ -19,13 +18,13 @@ from hoidata.hands import JOINT_NAMES, PARENTS
 from pipelines.exports.motion import ExportedClip, hinge_of
 from pipelines.pages.glb import upright_rotation
 
-# The last joint of the finger each tip follows: index, middle, pinky, ring, thumb.
+# Parents of the tips: the last joints of index, middle, pinky, ring, thumb.
 _TREE = (*PARENTS, 3, 6, 9, 12, 15)
 _CHANNELS = "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"
 
 
 def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
-    """Write <clip>/left.bvh, right.bvh (a hand that is never valid is left out), object.bvh and clip.json."""
+    """Write <clip>/left.bvh, right.bvh, object.bvh and clip.json; hands without a valid frame are skipped."""
     for item in clips:
         (folder / item.file_name).mkdir()
         skeletons = {
@@ -41,54 +40,64 @@ def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
 
 
 def _upright(positions_m: np.ndarray, rotations: Rotation, up_from_world: Rotation) -> tuple[np.ndarray, Rotation]:
-    """The motion with its root turned; all other joints are relative to their parents."""
-    turned_m, rotvec = positions_m.copy(), rotations.as_rotvec().reshape(positions_m.shape)
-    turned_m[:, 0] = up_from_world.apply(positions_m[:, 0])
+    """Rotate the root joint of a motion; all other joints are relative to their parents."""
+    rotated_m, rotvec = positions_m.copy(), rotations.as_rotvec().reshape(positions_m.shape)
+    rotated_m[:, 0] = up_from_world.apply(positions_m[:, 0])
     rotvec[:, 0] = (up_from_world * Rotation.from_rotvec(rotvec[:, 0])).as_rotvec()
-    return turned_m, Rotation.from_rotvec(rotvec.reshape(-1, 3))
+    return rotated_m, Rotation.from_rotvec(rotvec.reshape(-1, 3))
 
 
 def _hand_motion(item: ExportedClip, side: Side) -> tuple[np.ndarray, Rotation]:
-    """(frame, 21, 3) positions in the parent's frame, and (frame x 21) rotations relative to it."""
+    """Joint positions (frame, 21, 3) in the parent joint's frame, metres, and rotations (frame x 21) relative to it."""
     hand, joints = item.clip.hands[side], item.joints[side].astype(np.float64)
-    own = np.zeros((hand.n_frames, 21, 3))
-    own[:, :16] = np.concatenate([hand.global_orient, hand.hand_pose], axis=1).reshape(-1, 16, 3)
-    turns, positions = [Rotation.from_rotvec(own[:, 0])], [joints[:, 0]]
+    local_rotvec = np.zeros((hand.n_frames, 21, 3))  # tips do not rotate
+    local_rotvec[:, :16] = np.concatenate([hand.global_orient, hand.hand_pose], axis=1).reshape(-1, 16, 3)
+    world_rotations, positions = [Rotation.from_rotvec(local_rotvec[:, 0])], [joints[:, 0]]
     for joint, parent in list(enumerate(_TREE))[1:]:
-        positions.append(turns[parent].inv().apply(joints[:, joint] - joints[:, parent]))
-        turns.append(turns[parent] * Rotation.from_rotvec(own[:, joint]))
-    return np.stack(positions, axis=1), Rotation.from_rotvec(own.reshape(-1, 3))
+        positions.append(world_rotations[parent].inv().apply(joints[:, joint] - joints[:, parent]))
+        world_rotations.append(world_rotations[parent] * Rotation.from_rotvec(local_rotvec[:, joint]))
+    return np.stack(positions, axis=1), Rotation.from_rotvec(local_rotvec.reshape(-1, 3))
 
 
 def _object_motion(track: ObjectTrack) -> tuple[tuple[str, ...], tuple[int, ...], np.ndarray, Rotation]:
-    """The object, and below it the part its hinge moves."""
-    place, turn = np.asarray(track.translation_m, np.float64), np.asarray(track.rotvec, np.float64)
+    """A joint for the object, with a child joint for the part that its hinge moves."""
+    translation_m, rotvec = np.asarray(track.translation_m, np.float64), np.asarray(track.rotvec, np.float64)
     if track.model.hinge is None:
-        return ("object",), (-1,), place[:, None], Rotation.from_rotvec(turn)
+        return ("object",), (-1,), translation_m[:, None], Rotation.from_rotvec(rotvec)
     hinge = track.model.hinge
-    places = np.stack([place, np.broadcast_to(hinge.origin_m, place.shape)], axis=1)
-    turns = np.stack([turn, hinge.axis * hinge_of(track)[:, None]], axis=1)
-    return ("object", "moving_part"), (-1, 0), places, Rotation.from_rotvec(turns.reshape(-1, 3))
+    positions_m = np.stack([translation_m, np.broadcast_to(hinge.origin_m, translation_m.shape)], axis=1)
+    rotvecs = np.stack([rotvec, hinge.axis * hinge_of(track)[:, None]], axis=1)
+    return ("object", "moving_part"), (-1, 0), positions_m, Rotation.from_rotvec(rotvecs.reshape(-1, 3))
 
 
-def _write_bvh(path: Path, names: Iterable[str], tree: tuple[int, ...], places_m: np.ndarray, turns: Rotation) -> None:
-    """places_m: (frame, joint, 3) in the parent's frame. turns: (frame x joint) relative to the parent."""
+def _write_bvh(
+    path: Path, names: Iterable[str], tree: tuple[int, ...], positions_m: np.ndarray, rotations: Rotation
+) -> None:
+    """Write one BVH file.
+
+    Args:
+        path: of the file.
+        names: of the joints.
+        tree: index of each joint's parent; -1 for the root.
+        positions_m: (frame, joint, 3) in the parent joint's frame.
+        rotations: (frame x joint) relative to the parent joint.
+    """
     names = list(names)
     order: list[int] = []
-    lines = ["HIERARCHY", *_joint_lines(0, names, tree, places_m[0], 0, order)]
+    lines = ["HIERARCHY", *_joint_lines(0, names, tree, positions_m[0], 0, order)]
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Gimbal lock")  # any of the triples that say the same rotation will do
-        angles = turns.as_euler("ZXY", degrees=True).reshape(places_m.shape)
-    rows = np.concatenate([places_m, angles], axis=2)[:, order].reshape(len(places_m), -1)
-    lines += ["MOTION", f"Frames: {len(rows)}", f"Frame Time: {1 / FPS:.8f}"]
-    lines += [" ".join(f"{value:.7g}" for value in row) for row in rows]
+        warnings.filterwarnings("ignore", "Gimbal lock")  # any of the equivalent angle triples will do
+        angles_deg = rotations.as_euler("ZXY", degrees=True).reshape(positions_m.shape)
+    channels = np.concatenate([positions_m, angles_deg], axis=2)[:, order].reshape(len(positions_m), -1)
+    lines += ["MOTION", f"Frames: {len(channels)}", f"Frame Time: {1 / FPS:.8f}"]
+    lines += [" ".join(f"{value:.7g}" for value in frame) for frame in channels]
     path.write_text("\n".join(lines) + "\n")
 
 
 def _joint_lines(
     joint: int, names: list[str], tree: tuple[int, ...], offsets_m: np.ndarray, depth: int, order: list[int]
 ) -> list[str]:
-    """The lines of a joint and all below it; ``order`` collects the joints as they come."""
+    """The hierarchy lines of a joint and its descendants; appends the joints to ``order`` in the order of the lines."""
     order.append(joint)
     indent = "  " * depth
     children = [child for child, parent in enumerate(tree) if parent == joint]

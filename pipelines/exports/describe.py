@@ -1,6 +1,6 @@
-"""What an export says of itself: croissant.json (Croissant 1.1 with its responsible-AI terms) and a dataset card.
+"""The description of an export: croissant.json (Croissant 1.1 with responsible-AI terms) and a dataset card.
 
-All of it comes from the store's facts; there is no date in it, so equal stores give equal bytes.
+It is derived from the store's facts and has no date, so that equal stores give equal bytes.
 """
 
 import re
@@ -26,7 +26,7 @@ from pipelines.exports.motion import Column
 _MARKUP = re.compile(r"[\\`*_\[\]|~$]")
 CROISSANT = "http://mlcommons.org/croissant/1.1"
 RESPONSIBLE = "http://mlcommons.org/croissant/RAI/1.0"
-HOMEPAGE = "https://schema.org/Dataset"  # where a dataset names no page of its own
+HOMEPAGE = "https://schema.org/Dataset"  # for a dataset without a page
 _ENCODINGS = {
     ".parquet": "application/x-parquet",
     ".json": "application/json",
@@ -62,75 +62,87 @@ CONTEXT: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Description:
-    """What an export says of its form.
+    """The facts of an export format that its description states."""
 
-    meaning: one line for people. world: which frame its coordinates are in. untracked: what the numbers of a hand are
-    in frames without tracking. columns: the arrays that a user reads by name.
-    """
-
-    meaning: str
-    world: str
-    untracked: str
-    columns: tuple[Column, ...]
-    for_own_use: bool
+    meaning: str  # one line for people
+    world: str  # the frame of its coordinates
+    untracked: str  # the values of a hand in frames without tracking
+    columns: tuple[Column, ...]  # arrays with a documented meaning
+    for_own_use: bool  # whether it has data that must not be shared
 
 
-def write_description(folder: Path, store: Store, to: str, form: Description) -> None:
-    """Write croissant.json and README.md into ``folder``, about the files there; for ``croissant`` about the store."""
+def write_description(folder: Path, store: Store, to: str, description: Description) -> None:
+    """Write croissant.json and README.md about the files in ``folder``; for the format croissant, about the store."""
     root = store.folder if to == "croissant" else folder
-    described = croissant(root, store, form)
-    (folder / "croissant.json").write_bytes(orjson.dumps(described, option=orjson.OPT_INDENT_2) + b"\n")
-    (folder / "README.md").write_text(dataset_card(root, store, form), encoding="utf-8")
+    values = croissant(root, store, description)
+    (folder / "croissant.json").write_bytes(orjson.dumps(values, option=orjson.OPT_INDENT_2) + b"\n")
+    (folder / "README.md").write_text(dataset_card(root, store, description), encoding="utf-8")
 
 
-def croissant(root: Path, store: Store, form: Description) -> dict[str, Any]:
-    """The description of the files below ``root``, as JSON-LD; their addresses are relative to it."""
+def croissant(root: Path, store: Store, description: Description) -> dict[str, Any]:
+    """The description of the files below ``root`` as JSON-LD, with relative addresses."""
     info, name = store.info, _name(store)
     files = [path for path in sorted(root.rglob("*")) if path.is_file() and not path.name.startswith(".")]
     facts = dataset_facts(str(info["dataset"]))
-    rows = licences_of(info)
-    described: dict[str, Any] = {
+    array_licences = licences_of(info)
+    values: dict[str, Any] = {
         "@context": CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": [CROISSANT, RESPONSIBLE],
         "name": name,
-        "description": f"{_summary(store)} {_sentence(form.meaning)}",
-        "license": list(dict.fromkeys(map(_licence_address, rows))),
+        "description": f"{_summary(store)} {_sentence(description.meaning)}",
+        "license": list(dict.fromkeys(map(_licence_address, array_licences))),
         "url": _address(str(info.get("where_to_register", ""))),
         "version": _version(str(info["dataset_version"])),
         "keywords": ["hand-object interaction", "motion", "MANO", str(info["dataset"])],
         "citeAs": facts.paper if facts and facts.paper else name,
-        **{f"rai:{key}": value for key, value in _responsible(store, form).items()},
+        **{f"rai:{key}": value for key, value in _responsible(store, description).items()},
     }
-    if form.for_own_use:
-        described["usageInfo"] = OWN_USE
-    described["distribution"] = [_file_object(root, path, rows) for path in files]
-    meanings = {column.name: column.meaning for column in form.columns}
-    described["recordSet"] = [_record_set(root, path, meanings) for path in files if path.suffix == ".parquet"]
-    return described
+    if description.for_own_use:
+        values["usageInfo"] = OWN_USE
+    values["distribution"] = [_file_object(root, path, array_licences) for path in files]
+    meanings = {column.name: column.meaning for column in description.columns}
+    values["recordSet"] = [_record_set(root, path, meanings) for path in files if path.suffix == ".parquet"]
+    return values
 
 
-def dataset_card(root: Path, store: Store, form: Description) -> str:
-    """README.md with the front matter Hugging Face reads: licence, files of each subset; and the licence per array."""
-    info, rows = store.info, licences_of(store.info)
-    lines = [f"# {markdown_text(_name(store))}", "", markdown_text(_summary(store)), "", _sentence(form.meaning), ""]
-    if form.for_own_use:
+def dataset_card(root: Path, store: Store, description: Description) -> str:
+    """README.md with front matter for Hugging Face (licence, files per subset), conventions and licence per array."""
+    info, array_licences = store.info, licences_of(store.info)
+    lines = [
+        f"# {markdown_text(_name(store))}",
+        "",
+        markdown_text(_summary(store)),
+        "",
+        _sentence(description.meaning),
+        "",
+    ]
+    if description.for_own_use:
         lines += [f"**Exported {OWN_USE}.**", ""]
-    lines += _conventions(info, form)
-    lines += ["", "## Licence per array", "", "| arrays | what | SPDX | may be passed on |", "|---|---|---|---|"]
-    lines += [f"| {r.kind.name} | {r.kind.meaning} | {r.spdx} | {'yes' if r.may_be_shared else 'no'} |" for r in rows]
-    lines += ["", *(f"- {r.spdx}: {markdown_text(r.licence)}" for r in {row.spdx: row for row in rows}.values())]
-    lines += ["", "## How it came about", ""]
-    for key, value in _responsible(store, form).items():
+    lines += _conventions(info, description)
+    lines += ["", "## Licence per array", "", "| arrays | content | SPDX | may be shared |", "|---|---|---|---|"]
+    lines += [
+        f"| {item.kind.name} | {item.kind.meaning} | {item.spdx} | {'yes' if item.may_be_shared else 'no'} |"
+        for item in array_licences
+    ]
+    lines += [
+        "",
+        *(
+            f"- {item.spdx}: {markdown_text(item.licence)}"
+            for item in {item.spdx: item for item in array_licences}.values()
+        ),
+    ]
+    lines += ["", "## Provenance", ""]
+    for key, value in _responsible(store, description).items():
         lines.append(f"- {key}: {markdown_text('; '.join(value) if isinstance(value, list) else value)}")
-    return f"---\n{_front_matter(root, store, rows)}---\n\n" + "\n".join(lines) + "\n"
+    return f"---\n{_front_matter(root, store, array_licences)}---\n\n" + "\n".join(lines) + "\n"
 
 
-def _front_matter(root: Path, store: Store, rows: tuple[ArrayLicence, ...]) -> str:
-    spdx = rows[0].spdx
-    known = {"CC0-1.0": "cc0-1.0"}.get(spdx, spdx.lower() if spdx.startswith("CC-") else "other")
-    facts: dict[str, Any] = {"pretty_name": _name(store), "license": known}
-    facts |= {"license_name": spdx.lower()} if known == "other" else {}
+def _front_matter(root: Path, store: Store, array_licences: tuple[ArrayLicence, ...]) -> str:
+    spdx = array_licences[0].spdx
+    licence = {"CC0-1.0": "cc0-1.0"}.get(spdx, spdx.lower() if spdx.startswith("CC-") else "other")
+    facts: dict[str, Any] = {"pretty_name": _name(store), "license": licence}
+    facts |= {"license_name": spdx.lower()} if licence == "other" else {}
     facts["tags"] = ["hand-object-interaction", "robotics", "3d"]
     if data := sorted((root / "data").glob("*.parquet")):
         files = [{"split": path.stem, "path": f"data/{path.name}"} for path in data]
@@ -138,25 +150,26 @@ def _front_matter(root: Path, store: Store, rows: tuple[ArrayLicence, ...]) -> s
     return yaml.safe_dump(facts, sort_keys=False, allow_unicode=True)
 
 
-def _conventions(info: dict[str, Any], form: Description) -> list[str]:
-    """Lines: frame, units and hand model, and the meaning of each array."""
+def _conventions(info: dict[str, Any], description: Description) -> list[str]:
+    """Markdown lines about frame, units, hand model, and the meaning of each array."""
     frame, hand = info["frame"], info["hand_model"]
     up = f"its up axis is {frame['up_axis']}" if frame["up_axis"] else "its up axis is not stated"
     lines = [
-        "## What the numbers mean",
+        "## Conventions",
         "",
         f"- Units: metre, radian, second; {info['fps']} frames per second; column vectors; right-handed.",
-        f"- World frame: {form.world}. The source's: {markdown_text(frame['note'])}; {up}; gravity {frame['gravity']}.",
+        f"- World frame: {description.world}. The source's: {markdown_text(frame['note'])}; {up}; "
+        f"gravity {frame['gravity']}.",
         f"- Hand model: {markdown_text(hand['name'])}, SHA-256 {markdown_text(hand['digest'])}. Hand parameters are "
-        "relative to it: angles to its flat hand, shape to its template unless a person's own rest mesh is given. "
+        "relative to it: angles to its flat hand, shape to its template unless a personal rest mesh is given. "
         "The wrist joint is joint 0; it is not MANO's transl.",
-        f"- Frames in which a hand is not tracked are marked; {form.untracked}.",
+        f"- Frames in which a hand is not tracked are marked; {description.untracked}.",
     ]
     if stand_in := stand_in_note(info):
         lines.append(f"- Warning: {markdown_text(stand_in)}.")
-    if form.columns:
+    if description.columns:
         lines += ["", "| array | type | shape | meaning |", "|---|---|---|---|"]
-        lines += [f"| {c.name} | {c.dtype} | {list(c.shape) or ''} | {c.meaning} |" for c in form.columns]
+        lines += [f"| {c.name} | {c.dtype} | {list(c.shape) or ''} | {c.meaning} |" for c in description.columns]
     return lines
 
 
@@ -164,8 +177,8 @@ def _sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def _responsible(store: Store, form: Description) -> dict[str, Any]:
-    """Croissant's responsible-AI terms that the facts of a store can fill."""
+def _responsible(store: Store, description: Description) -> dict[str, Any]:
+    """The responsible-AI terms of Croissant that the facts of a store provide."""
     info, counts, rows = store.info, store.info["counts"], store.sequences
     facts = dataset_facts(str(info["dataset"]))
     errors_m = rows["fit_error_m"].dropna().tolist()  # of hands fitted to keypoints
@@ -175,21 +188,21 @@ def _responsible(store: Store, form: Description) -> dict[str, Any]:
     if errors_m:
         error_mm = 1000 * sum(errors_m) / len(errors_m)
         limits.append(f"hands of {len(errors_m)} clips are fitted to keypoints, mean error {error_mm:.1f} mm")
-    made = "generated by code in the raw format of" if info["synthetic"] else "recorded by the authors of"
+    origin = "generated by code in the raw format of" if info["synthetic"] else "recorded by the authors of"
     return {
-        "dataCollection": f"{made[0].upper()}{made[1:]} {source}; {counts['files']} raw files",
+        "dataCollection": f"{origin[0].upper()}{origin[1:]} {source}; {counts['files']} raw files",
         "dataCollectionType": ["Synthetic data"] if info["synthetic"] else ["Physical data collection"],
         "dataCollectionRawData": str(info.get("where_to_register", "see dataCollection")),
         "dataCollectionMissingData": (
-            f"{counts['quarantined']} sequences or intervals are left out, with reasons in quarantine.parquet; "
-            f"frames in which a hand is not tracked are marked; {form.untracked}"
+            f"{counts['quarantined']} sequences or intervals are excluded, with reasons in quarantine.parquet; "
+            f"frames in which a hand is not tracked are marked; {description.untracked}"
         ),
         "dataPreprocessingProtocol": [
             f"resampled from {info['source_fps']:g} to {info['fps']} frames per second, metres, right-handed world",
             f"hands: {info['hand_convention']['note']}; stored with absolute angles, hand model "
             f"{info['hand_model']['name']}",
         ],
-        "dataAnnotationProtocol": "verbs and objects as labelled by the source; sentences are made from them by rules",
+        "dataAnnotationProtocol": "verbs and objects as labelled by the source; sentences from rules applied to them",
         "dataBiases": [
             f"{rows['subject'].nunique()} subjects, {counts['objects']} objects, {len(verbs)} verbs; most frequent: "
             + ", ".join(f"{verb} ({count})" for verb, count in sorted(verbs.items(), key=_by_count)[:3])
@@ -221,24 +234,24 @@ def _summary(store: Store) -> str:
 
 
 def _version(text: str) -> str:
-    """As Croissant wants it, major.minor.patch."""
+    """A version in the format of Croissant, major.minor.patch."""
     numbers = text.split(".")
     return ".".join([*numbers, "0", "0"][:3]) if all(map(str.isdigit, numbers)) else "0.0.0"
 
 
-def _address(where: str) -> str:
-    """The first address in ``where``; Croissant asks for one."""
-    found = [word.strip("(),;") for word in where.split() if word.startswith("https://")]
-    return found[0] if found else HOMEPAGE
+def _address(text: str) -> str:
+    """The first web address in a text, else a default, since Croissant requires one."""
+    addresses = [word.strip("(),;") for word in text.split() if word.startswith("https://")]
+    return addresses[0] if addresses else HOMEPAGE
 
 
-def _licence_address(row: ArrayLicence) -> str:
-    return row.licence if row.spdx.startswith("LicenseRef") else f"https://spdx.org/licenses/{row.spdx}.html"
+def _licence_address(item: ArrayLicence) -> str:
+    return item.licence if item.spdx.startswith("LicenseRef") else f"https://spdx.org/licenses/{item.spdx}.html"
 
 
-def _file_object(root: Path, path: Path, rows: tuple[ArrayLicence, ...]) -> dict[str, Any]:
+def _file_object(root: Path, path: Path, array_licences: tuple[ArrayLicence, ...]) -> dict[str, Any]:
     name = path.relative_to(root).as_posix()
-    described: dict[str, Any] = {
+    values: dict[str, Any] = {
         "@type": "cr:FileObject",
         "@id": name,
         "name": name,
@@ -248,21 +261,20 @@ def _file_object(root: Path, path: Path, rows: tuple[ArrayLicence, ...]) -> dict
         "sha256": sha256_file(path),
     }
     if file := next((file for file in STORE_FILES if fnmatch(name, file.path)), None):
-        described["description"] = _about(file, rows)
-    return described
+        values["description"] = _about(file, array_licences)
+    return values
 
 
-def _about(file: StoreFile, rows: tuple[ArrayLicence, ...]) -> str:
-    """Meaning and licence of a file of a store, and of its arrays where it is no table."""
-    here = [row for row in rows if file.path in row.kind.arrays]
-    licences = ", ".join(dict.fromkeys(row.spdx for row in here))
+def _about(file: StoreFile, array_licences: tuple[ArrayLicence, ...]) -> str:
+    """Meaning and licence of a file of a store, and for an NPZ file of its arrays."""
+    licences = ", ".join(dict.fromkeys(item.spdx for item in array_licences if file.path in item.kind.arrays))
     arrays = [f"{f.name} {f.dtype}: {f.meaning}{f', {f.unit}' if f.unit else ''}" for f in file.fields]
     listed = f" Arrays: {'; '.join(arrays)}." if file.path.endswith(".npz") else ""
     return f"{file.meaning}.{f' Licence: {licences}.' if licences else ''}{listed}"
 
 
 def _record_set(root: Path, path: Path, meanings: dict[str, str]) -> dict[str, Any]:
-    """The columns of a Parquet file. meanings: of columns in an export; those of a store's files are known."""
+    """The columns of a Parquet file, with ``meanings`` by name; for a file of a store, those of its schema."""
     name = path.relative_to(root).as_posix()
     record = name.removesuffix(".parquet").replace("/", "_")
     if file := next((file for file in STORE_FILES if file.path == name), None):
@@ -272,22 +284,22 @@ def _record_set(root: Path, path: Path, meanings: dict[str, str]) -> dict[str, A
 
 
 def _field(record: str, file: str, column: pa.Field, meaning: str) -> dict[str, Any]:
-    kind, lengths = column.type, []
-    while pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
-        lengths.append(str(kind.list_size) if pa.types.is_fixed_size_list(kind) else "-1")
-        kind = kind.value_type
-    described: dict[str, Any] = {
+    dtype, lengths = column.type, []
+    while pa.types.is_list(dtype) or pa.types.is_fixed_size_list(dtype):
+        lengths.append(str(dtype.list_size) if pa.types.is_fixed_size_list(dtype) else "-1")
+        dtype = dtype.value_type
+    values: dict[str, Any] = {
         "@type": "cr:Field",
         "@id": f"{record}/{column.name}",
         "name": f"{record}/{column.name}",
-        "dataType": _TYPES.get(str(kind), "sc:Text"),
+        "dataType": _TYPES.get(str(dtype), "sc:Text"),
         "source": {"fileObject": {"@id": file}, "extract": {"column": column.name}},
     }
     if meaning:
-        described["description"] = meaning
-    return described | ({"isArray": True, "arrayShape": ",".join(lengths)} if lengths else {})
+        values["description"] = meaning
+    return values | ({"isArray": True, "arrayShape": ",".join(lengths)} if lengths else {})
 
 
 def markdown_text(text: Any) -> str:
-    """Text of a file as text in Markdown: on one line, and nothing in it is markup, HTML or the border of a table."""
+    """Text as plain text in Markdown: on one line, with markup, HTML and table borders escaped."""
     return _MARKUP.sub(r"\\\g<0>", " ".join(str(text).split())).replace("&", "&amp;").replace("<", "&lt;")

@@ -1,4 +1,4 @@
-"""A store written in another project's form, with croissant.json, README.md and export.json beside what was written."""
+"""Write a store in the format of another project, with croissant.json, README.md and export.json."""
 
 import io
 import tarfile
@@ -29,7 +29,7 @@ from pipelines.exports.licences import (
     SKIN,
     WORDS,
     Kind,
-    check_may_be_passed_on,
+    check_may_be_shared,
     licences_of,
 )
 from pipelines.exports.motion import CLIP_COLUMNS, COLUMNS, WORLD, Y_UP, Column, ExportedClip, Source
@@ -42,27 +42,19 @@ _COLUMNS = (*COLUMNS, *CLIP_COLUMNS)
 _SCENE = (HANDS, OBJECT, MESHES, PERSON, SKIN)
 
 
-def _everything(_: Clip) -> str:
-    return ""
-
-
 @dataclass(frozen=True)
 class Format:
-    """One form. meaning: one line for people. kinds: the arrays it can hold.
+    """An export format."""
 
-    write: (folder, clips); None: a description alone. cannot: why it has no form for a clip, "" where it has.
-    world: which frame its coordinates are in. columns: the arrays that a user reads by name.
-    """
+    meaning: str  # one line for people
+    kinds: tuple[Kind, ...]  # of the arrays it can have
+    write: Callable[[Path, Iterable[ExportedClip]], None] | None  # None: the description alone
+    unsupported: Callable[[Clip], str] = lambda clip: ""  # the reason why it cannot represent a clip; "" if it can
+    world: str = WORLD  # the frame of its coordinates
+    columns: tuple[Column, ...] = ()  # arrays with a documented meaning
 
-    meaning: str
-    kinds: tuple[Kind, ...]
-    write: Callable[[Path, Iterable[ExportedClip]], None] | None
-    cannot: Callable[[Clip], str] = _everything
-    world: str = WORLD
-    columns: tuple[Column, ...] = ()
-
-    def held_kinds(self, store: Store) -> tuple[Kind, ...]:
-        """The kinds of arrays that an export of this store holds: rest meshes of persons only where it has some."""
+    def kinds_in(self, store: Store) -> tuple[Kind, ...]:
+        """The kinds of arrays in an export of this store: personal rest meshes only if the store has some."""
         templates = store.sequences[[f"{side}_template" for side in SIDES]].notna()
         return tuple(kind for kind in self.kinds if kind is not PERSON or templates.to_numpy().any())
 
@@ -70,7 +62,7 @@ class Format:
 def _write_glb(folder: Path, clips: Iterable[ExportedClip]) -> None:
     """Write <clip>.glb: the animated scene of the pages, with the 21 joints of each hand as empty nodes.
 
-    The nodes are exact where glTF's skins are not: those leave out pose correctives, and shapes that change.
+    The nodes are exact. The skins of glTF are not, because they have no pose correctives and no changing shapes.
     """
     for item in clips:
         markers: dict[Side, np.ndarray] = {
@@ -81,9 +73,10 @@ def _write_glb(folder: Path, clips: Iterable[ExportedClip]) -> None:
 
 
 def _write_web_dataset(folder: Path, clips: Iterable[ExportedClip]) -> None:
-    """Write WebDataset shards <subset>-<number>.tar, ``all-`` for clips in no subset, which follow each other.
+    """Write WebDataset shards <subset>-<number>.tar; ``all-<number>.tar`` has the clips without subset.
 
-    ``<number>.npz`` of a clip has the arrays of ``COLUMNS`` and ``CLIP_COLUMNS``, ``<number>.json`` the facts.
+    A clip is ``<number>.npz`` with the arrays of ``COLUMNS`` and ``CLIP_COLUMNS``, and ``<number>.json`` with facts.
+    Clips of one subset must follow each other.
     """
     for subset, group in groupby(clips, key=lambda item: item.subset):
         for shard, numbered in groupby(enumerate(group), key=lambda pair: pair[0] // CLIPS_PER_SHARD):
@@ -96,13 +89,15 @@ def _add_to_tar(tar: tarfile.TarFile, key: str, item: ExportedClip) -> None:
     arrays = io.BytesIO()
     write_npz_to(arrays, item.arrays() | item.clip_arrays())
     for suffix, content in (("npz", arrays.getvalue()), ("json", orjson.dumps(item.facts))):
-        member = tarfile.TarInfo(f"{key}.{suffix}")  # dated 1970: equal clips, equal bytes
+        member = tarfile.TarInfo(f"{key}.{suffix}")  # dated 1970, so that equal clips give equal bytes
         member.size = len(content)
         tar.addfile(member, io.BytesIO(content))
 
 
 FORMATS = {
-    "croissant": Format("croissant.json and a dataset card for the store itself, to lie beside its meta/", (), None),
+    "croissant": Format(
+        "croissant.json and a dataset card for the store itself, to be stored next to its meta/", kinds=(), write=None
+    ),
     "lerobot": Format(
         "LeRobot v3: 2 x 21 joints, object, sentences as tasks", _MOTION, lerobot.write, columns=lerobot.COLUMNS
     ),
@@ -116,7 +111,11 @@ FORMATS = {
     "usd": Format("a stage per clip, meshes with time samples", _SCENE, usd.write, world=Y_UP),
     "bvh": Format("a skeleton per hand, and the object's motion", (HANDS, OBJECT), bvh.write, world=Y_UP),
     "spider": Format(
-        "SPIDER's keypoints and meshes", (HANDS, OBJECT, MESHES), spider.write, spider.cannot, spider.WORLD
+        "SPIDER's keypoints and meshes",
+        (HANDS, OBJECT, MESHES),
+        spider.write,
+        unsupported=spider.unsupported,
+        world=spider.WORLD,
     ),
 }
 
@@ -124,29 +123,42 @@ FORMATS = {
 def export_store(
     store: Store, to: str, out: Path, clip_ids: tuple[str, ...] = (), for_own_use: bool = False, progress: bool = True
 ) -> dict[str, Any]:
-    """Write the clips of a store as the new folder ``out``; equal stores give equal bytes; returns export.json.
+    """Write the clips of a store into a new folder. Equal stores give equal bytes.
 
-    to: a key of ``FORMATS``. clip_ids: by default all. Raises BadInput for an unknown format or clip, for a store
-    without clips, for an ``out`` that is there, and where a licence forbids passing on what is not for_own_use.
+    Args:
+        store: the store of clips.
+        to: the format, a key of ``FORMATS``.
+        out: the output folder; must not exist.
+        clip_ids: the clips to export; empty for all.
+        for_own_use: whether to export data that must not be shared.
+        progress: whether to show a progress bar.
+
+    Returns:
+        The content of export.json.
+
+    Raises:
+        BadInput: the format or a clip is unknown, the store has no clips, ``out`` exists, or a licence forbids sharing.
     """
     form = _format(to)
     if out.exists():
-        raise BadInput(out, "a folder that is not there yet", "something else", "choose another name, or remove it")
+        raise BadInput(
+            out, "a path that does not exist", "an existing file or folder", "choose another name, or remove it"
+        )
     _check_clips(store, clip_ids)
-    check_may_be_passed_on(str(store.folder), store.info, form.held_kinds(store), for_own_use)
-    source, left_out = Source(store, clip_ids), {}
+    check_may_be_shared(str(store.folder), store.info, form.kinds_in(store), for_own_use)
+    source, skipped = Source(store, clip_ids), {}
     with atomic_folder(out) as partial, Progress(console=Console(stderr=True), disable=not progress) as bar:
         if form.write is not None:
             task = bar.add_task(f"export to {to}", total=len(source.ids))
-            form.write(partial, _clips(source, form, left_out, lambda: bar.advance(task)))
-        if len(left_out) == len(source.ids):
-            reason = next(iter(left_out.values()))
-            raise BadInput(store.folder, f"clips that {to} has a form for", f"none: {reason}", "choose another format")
-        facts = _facts(store, to, form, for_own_use) | {"clips": len(source.ids) - len(left_out), "left_out": left_out}
-        untracked = "their numbers mean nothing" if form.write is None else "they repeat its last tracked pose"
-        described = Description(form.meaning, form.world, untracked, form.columns, for_own_use)
+            form.write(partial, _clips(source, form, skipped, lambda: bar.advance(task)))
+        if len(skipped) == len(source.ids):
+            reason = next(iter(skipped.values()))
+            raise BadInput(store.folder, f"clips that {to} can represent", f"none: {reason}", "choose another format")
+        facts = _facts(store, to, form, for_own_use) | {"clips": len(source.ids) - len(skipped), "left_out": skipped}
+        untracked = "their values are undefined" if form.write is None else "they repeat its last tracked pose"
+        description = Description(form.meaning, form.world, untracked, columns=form.columns, for_own_use=for_own_use)
         (partial / "export.json").write_bytes(orjson.dumps(facts, option=orjson.OPT_INDENT_2) + b"\n")
-        write_description(partial, store, to, described)
+        write_description(partial, store, to, description)
     return facts
 
 
@@ -160,23 +172,23 @@ def _check_clips(store: Store, clip_ids: tuple[str, ...]) -> None:
     if not len(store):
         raise BadInput(store.folder, "a store with clips", "none", "convert raw data first")
     if unknown := [clip_id for clip_id in clip_ids if clip_id not in store.sequences.index]:
-        near = ", ".join(store.ids[:3])
-        raise BadInput("--clip", f"ids of clips of {store.folder}", unknown[0], f"choose one, such as {near}")
+        examples = ", ".join(store.ids[:3])
+        raise BadInput("--clip", f"ids of clips of {store.folder}", unknown[0], f"choose one, such as {examples}")
 
 
-def _clips(source: Source, form: Format, left_out: dict[str, str], done: Callable[[], None]) -> Iterator[ExportedClip]:
-    """The clips the format has a form for, one at a time; ``left_out`` gets the reason of the others."""
+def _clips(source: Source, form: Format, skipped: dict[str, str], done: Callable[[], None]) -> Iterator[ExportedClip]:
+    """Yield the clips that the format can represent; adds the reasons of the others to ``skipped``."""
     for clip_id in source.ids:
         item = source.clip(clip_id)
-        if reason := form.cannot(item.clip):
-            left_out[clip_id] = reason
+        if reason := form.unsupported(item.clip):
+            skipped[clip_id] = reason
         else:
             yield item
         done()
 
 
 def _facts(store: Store, to: str, form: Format, for_own_use: bool) -> dict[str, Any]:
-    info, rows = store.info, licences_of(store.info)
+    info, array_licences = store.info, licences_of(store.info)
     return {
         "format": to,
         "dataset": info["dataset"],
@@ -184,6 +196,6 @@ def _facts(store: Store, to: str, form: Format, for_own_use: bool) -> dict[str, 
         "synthetic": info["synthetic"],
         "hand_model": info["hand_model"],
         "world": form.world,
-        "terms": OWN_USE if for_own_use else "may be passed on under the licences below",
-        "licences": [row.as_json() for row in rows if row.kind in (form.held_kinds(store) or [row.kind])],
+        "terms": OWN_USE if for_own_use else "may be shared under the licences below",
+        "licences": [item.as_json() for item in array_licences if item.kind in (form.kinds_in(store) or [item.kind])],
     }

@@ -1,6 +1,6 @@
-"""A folder of Parquet that Hugging Face ``datasets`` loads: a row per clip, a file per subset.
+"""A folder of Parquet files for Hugging Face ``datasets``: a row per clip, a file per subset.
 
-The schema's metadata has the features as ``datasets`` before release 4 writes them, which later releases read too;
+The schema's metadata has the features in the format of ``datasets`` before release 4, which later releases also read.
 README.md names the file of each subset.
 """
 
@@ -17,14 +17,14 @@ import pyarrow.parquet as pq
 from pipelines.exports.motion import CLIP_COLUMNS, COLUMNS, Column, ExportedClip, frames_array, row_type
 
 _TEXTS = ("clip_id", "subject", "sequence", "verb", "object", "object_words", "gravity_note")
-WHOLE = "unsplit"  # the file of clips in no subset; datasets refuses "all"
+UNSPLIT = "unsplit"  # the file of clips without subset; datasets refuses "all"
 
 
 def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
-    """Write data/<subset>.parquet; clips of one subset follow each other."""
+    """Write data/<subset>.parquet; clips of one subset must follow each other."""
     (folder / "data").mkdir()
     for subset, group in groupby(clips, key=lambda item: item.subset):
-        with pq.ParquetWriter(folder / "data" / f"{subset or WHOLE}.parquet", _schema()) as parquet:
+        with pq.ParquetWriter(folder / "data" / f"{subset or UNSPLIT}.parquet", _schema()) as parquet:
             for item in group:
                 parquet.write_table(_row(item))
 
@@ -67,5 +67,5 @@ def _value(dtype: str) -> dict[str, Any]:
 
 
 def _list(feature: dict[str, Any], length: int = -1) -> dict[str, Any]:
-    """A list; length -1: any. Called Sequence, because ``List`` stops datasets before release 4 from opening a file."""
+    """A list feature; length -1 means any. Its type is Sequence, since datasets before release 4 does not read List."""
     return {"feature": feature, "length": length, "_type": "Sequence"}

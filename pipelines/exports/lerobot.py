@@ -1,9 +1,9 @@
 """LeRobot's dataset layout v3.0 (huggingface/lerobot, docs "LeRobotDataset v3"): an episode per clip, without video.
 
 ``observation.state`` and ``action`` are the 2 x 21 joints of this and of the next frame,
-``observation.environment_state`` the object: position, quaternion xyzw, hinge. ``observation.hand_valid`` and
-``next.hand_valid`` are the masks of state and action; statistics count only what they let through. Tasks are the
-sentences; a frame's task is the clip's first one.
+``observation.environment_state`` the object: position, quaternion xyzw, hinge angle. ``observation.hand_valid`` and
+``next.hand_valid`` are the masks of state and action; statistics count only valid values. Tasks are the sentences; a
+frame's task is the clip's first sentence.
 """
 
 from collections.abc import Iterable
@@ -21,27 +21,27 @@ from hoidata.store.annotated import SUBSETS
 from pipelines.exports.motion import Column, ExportedClip, frames_array, row_type, state_names
 
 VERSION = "v3.0"
-FRAMES_PER_FILE = 60_000  # about 100 MB, LeRobot's own size of a data file
+FRAMES_PER_FILE = 60_000  # about 100 MB, LeRobot's default size of a data file
 FILES_PER_CHUNK = 1000
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
 STATE, ACTION, OBJECT = "observation.state", "action", "observation.environment_state"
-# Not "action.": LeRobot gives its policies every feature of that prefix to predict.
+# Without the prefix "action.": LeRobot's policies predict all features with that prefix.
 VALID, NEXT_VALID = "observation.hand_valid", "next.hand_valid"
 _OBJECT_NAMES = [*(f"object.{axis}" for axis in "xyz"), *(f"object.q{axis}" for axis in "xyzw"), "object.hinge"]
 _HAND_NAMES = [name for side in SIDES for name in state_names(side)]
 _NAMES = {STATE: _HAND_NAMES, ACTION: _HAND_NAMES, OBJECT: _OBJECT_NAMES, VALID: list(SIDES), NEXT_VALID: list(SIDES)}
 _POSE = "origin of the object frame, quaternion xyzw of world_from_object, hinge angle from the mesh as stored"
 _TRACKED = (
-    "whether left and right hand are tracked; where not, the last tracked pose is repeated, before the first one "
-    "the first; zeros if a hand is never tracked in the clip"
+    "whether left and right hand are tracked; untracked frames repeat the last tracked pose, or before the first "
+    "tracked frame the first; zeros if a hand is never tracked in the clip"
 )
 COLUMNS = (
     Column(STATE, "float32", (126,), "21 joints of the left, then of the right hand; world frame, metre"),
-    Column(ACTION, "float32", (126,), "the same of the next frame; the last frame repeats its own"),
+    Column(ACTION, "float32", (126,), "observation.state of the next frame; the last frame repeats its state"),
     Column(OBJECT, "float32", (8,), f"{_POSE} (0 for a rigid object); world frame, metre, radian"),
     Column(VALID, "bool", (2,), _TRACKED),
-    Column(NEXT_VALID, "bool", (2,), f"the same of the next frame, so of {ACTION}; False in the last frame"),
+    Column(NEXT_VALID, "bool", (2,), f"{VALID} of the next frame, so of {ACTION}; False in the last frame"),
     Column("timestamp", "float32", (), "since the clip's first frame, second"),
     Column("frame_index", "int64", (), "frame of the episode, from 0"),
     Column("episode_index", "int64", (), "the clip, from 0"),
@@ -69,18 +69,18 @@ class _Writer:
         self._parquet: pq.ParquetWriter | None = None
 
     def add(self, item: ExportedClip) -> None:
-        """One episode: a row group of the data file, and its row of meta/episodes."""
-        numbers = [self.tasks.setdefault(sentence, len(self.tasks)) for sentence in item.sentences]
-        arrays = _frames(item) | self._indices(item.clip.n_frames, numbers[0])
+        """Add an episode: a row group of the data file, and a row of meta/episodes."""
+        task_indices = [self.tasks.setdefault(sentence, len(self.tasks)) for sentence in item.sentences]
+        arrays = _frames(item) | self._indices(item.clip.n_frames, task_indices[0])
         if self._parquet is None or self.in_file + item.clip.n_frames > FRAMES_PER_FILE:
             self._next_file()
         assert self._parquet is not None
         data = [frames_array(arrays[column.name], column) for column in COLUMNS]
         self._parquet.write_table(pa.Table.from_arrays(data, schema=_schema()))
         self.episodes.append(self._episode(item))
-        known = _known(item, arrays)
-        for name, rows in self.statistics.items():
-            rows.append(_statistics(arrays[name], known.get(name, True)))
+        masks = _valid_values(item, arrays)
+        for name, episodes in self.statistics.items():
+            episodes.append(_statistics(arrays[name], masks.get(name, True)))
         self.ranges.setdefault(item.subset, [len(self.episodes) - 1, 0])[1] = len(self.episodes)
         self.frames += item.clip.n_frames
         self.in_file += item.clip.n_frames
@@ -124,15 +124,15 @@ class _Writer:
         }
 
     def finish(self) -> None:
-        """The files of meta/."""
+        """Write the files of meta/."""
         assert self._parquet is not None
         self._parquet.close()
         path = self.folder / EPISODES_PATH
         path.parent.mkdir(parents=True)
-        totals = {name: _total(rows) for name, rows in self.statistics.items()}
-        for column, rows in self.statistics.items():
-            for episode, row in zip(self.episodes, rows, strict=True):
-                facts = _as_written(row, totals[column])
+        totals = {name: _total(episodes) for name, episodes in self.statistics.items()}
+        for column, statistics_of_episodes in self.statistics.items():
+            for episode, statistics in zip(self.episodes, statistics_of_episodes, strict=True):
+                facts = _as_written(statistics, totals[column])
                 episode |= {f"stats/{column}/{name}": value for name, value in facts.items()}
         pq.write_table(pa.Table.from_pylist(self.episodes), path)
         tasks = pd.DataFrame({"task_index": list(self.tasks.values())}, pd.Index(list(self.tasks), name="task"))
@@ -175,44 +175,44 @@ def _frames(item: ExportedClip) -> dict[str, np.ndarray]:
     }
 
 
-def _known(item: ExportedClip, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """(frame, number) booleans of the columns in which not every number is data: the others fill a place."""
+def _valid_values(item: ExportedClip, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """(frame, value) masks of the columns that have placeholders: poses of untracked hands, angles of no hinge."""
     has_hinge = np.ones((item.clip.n_frames, 8), bool)
     has_hinge[:, 7] = item.clip.object.is_articulated
     masks = {STATE: arrays[VALID], ACTION: arrays[NEXT_VALID]}
     return {OBJECT: has_hinge, **{name: mask.repeat(63, axis=1) for name, mask in masks.items()}}
 
 
-def _statistics(values: np.ndarray, known: np.ndarray | bool) -> dict[str, np.ndarray]:
-    """Statistics of each number over the frames in which it is known; NaN and a count of 0 for one that never is."""
-    rows = values.reshape(len(values), -1).astype(np.float64)
-    rows = np.ma.array(rows, mask=~np.broadcast_to(known, rows.shape))
-    found = {"min": rows.min(axis=0), "max": rows.max(axis=0), "mean": rows.mean(axis=0), "std": rows.std(axis=0)}
-    return {name: value.filled(np.nan) for name, value in found.items()} | {"count": rows.count(axis=0)}
+def _statistics(values: np.ndarray, valid: np.ndarray | bool) -> dict[str, np.ndarray]:
+    """Statistics of each value over its valid frames; NaN and a count of 0 if it has none."""
+    frames = values.reshape(len(values), -1).astype(np.float64)
+    frames = np.ma.array(frames, mask=~np.broadcast_to(valid, frames.shape))
+    statistics = {name: getattr(frames, name)(axis=0) for name in ("min", "max", "mean", "std")}
+    return {name: value.filled(np.nan) for name, value in statistics.items()} | {"count": frames.count(axis=0)}
 
 
-def _total(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def _total(episodes: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """Statistics of all frames, from those of the episodes (the law of total variance)."""
-    part = {name: np.stack([row[name] for row in parts]) for name in parts[0]}
-    count = part["count"].sum(axis=0)
-    with np.errstate(invalid="ignore"):  # 0 / 0: a number that no episode has
-        share = part["count"] / count
-    mean = _sum(share * part["mean"], count)
-    variance = _sum(share * (part["std"] ** 2 + (part["mean"] - mean) ** 2), count)
-    total = {"min": np.fmin.reduce(part["min"]), "max": np.fmax.reduce(part["max"]), "mean": mean}
+    stacked = {name: np.stack([statistics[name] for statistics in episodes]) for name in episodes[0]}
+    count = stacked["count"].sum(axis=0)
+    with np.errstate(invalid="ignore"):  # 0 / 0 for a value that is valid in no episode
+        weight = stacked["count"] / count
+    mean = _sum(weight * stacked["mean"], count)
+    variance = _sum(weight * (stacked["std"] ** 2 + (stacked["mean"] - mean) ** 2), count)
+    total = {"min": np.fmin.reduce(stacked["min"]), "max": np.fmax.reduce(stacked["max"]), "mean": mean}
     return total | {"std": np.sqrt(variance), "count": count}
 
 
 def _sum(values: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Sums over the episodes that have the number; NaN where none has."""
+    """Sums over the episodes in which a value is valid; NaN if it is valid in none."""
     return np.where(count > 0, np.nansum(values, axis=0), np.nan)
 
 
 def _as_written(statistics: dict[str, np.ndarray], total: dict[str, np.ndarray]) -> dict[str, list]:
-    """As LeRobot has them: finite numbers, and one count for all numbers of a column.
+    """Statistics in LeRobot's format: finite numbers, and one count for all values of a column.
 
-    A number that an episode never has gets the statistics of all episodes, which leave their merger as it is; one that
-    no episode has gets 0.
+    A value that is valid in no frame of an episode gets the statistics of all episodes, so that merging episodes does
+    not change them. A value that is valid in no episode gets 0.
     """
     names = ("min", "max", "mean", "std")
     filled = {name: np.where(statistics["count"] > 0, statistics[name], total[name]) for name in names}

@@ -1,4 +1,4 @@
-"""What is exported of one clip: joints, parameters, object pose and words, under the names all formats use."""
+"""The arrays and facts of one exported clip, which all formats use: joints, parameters, object poses, sentences."""
 
 import re
 from dataclasses import dataclass, replace
@@ -17,34 +17,30 @@ from hoidata.store.annotated import SUBSETS
 from hoidata.store.store import Store
 from pipelines.pages.glb import continuous_quaternions
 
-LONGEST_NAME = 150  # bytes; file systems take 255, and suffixes follow
-_ODD = re.compile(r"^\.|(?<=_)_|[^\w .,+=@()#-]")  # "_" after "_": two mean "/"
-WORLD = "the clip's own"
-Y_UP = "turned so that gravity is -y: y is up; not turned where a clip's gravity is not known"
+MAX_NAME_BYTES = 150  # file systems permit 255, including suffixes
+_ESCAPED = re.compile(r"^\.|(?<=_)_|[^\w .,+=@()#-]")  # "_" after "_": two mean "/"
+WORLD = "the world frame of the clip"
+Y_UP = "rotated so that gravity is -y, y is up; not rotated if a clip's gravity is not known"
 
 
 class Column(NamedTuple):
-    """One array of a clip.
-
-    shape: of one frame, () for one value; for ``CLIP_COLUMNS`` of the whole clip, -1 for a length that varies.
-    meaning: what it holds, relative to what, its frame and unit.
-    """
+    """One array of a clip."""
 
     name: str
     dtype: str
-    shape: tuple[int, ...]
-    meaning: str
+    shape: tuple[int, ...]  # per frame, () for one value; in ``CLIP_COLUMNS`` per clip, -1 for a varying length
+    meaning: str  # content, reference, frame and unit
 
 
 _JOINTS = "joints: wrist, three each of index, middle, pinky, ring and thumb, then their tips; world frame, metre"
-_REPEATED = "where not, its last tracked pose is repeated, before the first one the first"
+_REPEATED = "untracked frames repeat the last tracked pose, or before the first tracked frame the first"
 _POSE = "axis-angles of 15 finger joints relative to their parents; zero is the hand model's flat hand"
-_BETAS = "shape coefficients on the hand model's template; NaN where {}_template_m alone is the shape"
-_TEMPLATE = "778 vertices of the person's own {} rest mesh, in the place of the hand model's template, metre; "
+_BETAS = "shape coefficients on the hand model's template; NaN if {}_template_m alone is the shape"
+_TEMPLATE = "778 vertices of the person's {} rest mesh, which replaces the hand model's template, metre; "
 
 
 def _hand_columns(side: Side) -> tuple[Column, ...]:
-    """What is told of one hand in each frame."""
+    """The columns of one hand."""
     valid = f"whether the hand is tracked; {_REPEATED}; zeros if it is never tracked in the clip"
     return (
         Column(f"{side}_joints_m", "float32", (21, 3), _JOINTS),
@@ -64,9 +60,9 @@ COLUMNS = (
     Column("source_frames", "int32", (), "index in the source file, from 0"),
 )
 CLIP_COLUMNS = (
-    Column("gravity", "float32", (3,), "unit vector in which things fall; world frame; NaN where it is not known"),
+    Column("gravity", "float32", (3,), "unit vector of gravity; world frame; NaN if it is not known"),
     *(
-        Column(f"{side}_template_m", "float32", (-1, 3), f"{_TEMPLATE.format(side)}empty where the person has none")
+        Column(f"{side}_template_m", "float32", (-1, 3), f"{_TEMPLATE.format(side)}empty if the person has none")
         for side in SIDES
     ),
 )
@@ -74,29 +70,22 @@ CLIP_COLUMNS = (
 
 @dataclass(frozen=True)
 class ExportedClip:
-    """One clip. joints: (frame, 21, 3) float32 of each hand, metres, world. hands: the model of its parameters.
-
-    Both hands are as ``_held`` gives them. sentences: what it shows, in words; at least one. subset: train, validation
-    or test; empty for a clip in none.
-    """
+    """One clip. In untracked frames its hands repeat the last tracked pose."""
 
     clip: Clip
-    joints: dict[Side, np.ndarray]
-    hands: HandPair
-    sentences: tuple[str, ...]
-    subset: str = ""
+    joints: dict[Side, np.ndarray]  # (frame, 21, 3) float32 of each hand, metres, world
+    hands: HandPair  # the model of the hand parameters
+    sentences: tuple[str, ...]  # at least one
+    subset: str = ""  # train, validation or test; empty if the clip is in none
 
     @property
     def file_name(self) -> str:
-        """The id as the name of a file, without suffix."""
+        """The clip id as a file name without suffix."""
         return file_name_of(self.clip.clip_id)
 
     @property
     def motion_facts(self) -> dict[str, Any]:
-        """What a scene or skeleton needs beside its numbers, as JSON values.
-
-        untracked_frames: half-open ranges per hand in which its pose is repeated, not tracked.
-        """
+        """Facts for a scene or skeleton, as JSON values; untracked_frames are half-open ranges per hand."""
         clip = self.clip
         return {
             "clip_id": clip.clip_id,
@@ -111,7 +100,7 @@ class ExportedClip:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What is known of the whole clip, as JSON values."""
+        """All facts of the clip, as JSON values."""
         clip = self.clip
         return self.motion_facts | {
             "dataset": clip.dataset,
@@ -127,43 +116,43 @@ class ExportedClip:
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays of ``COLUMNS``, frame axis first, in their order."""
         clip, track = self.clip, self.clip.object
-        found: dict[str, Any] = {"source_frames": clip.source_frames}
+        arrays: dict[str, Any] = {"source_frames": clip.source_frames}
         for side in SIDES:
             hand = clip.hands[side]
-            found |= {
+            arrays |= {
                 f"{side}_joints_m": self.joints[side],
                 f"{side}_valid": hand.valid,
                 f"{side}_global_orient": hand.global_orient,
                 f"{side}_hand_pose": hand.hand_pose,
                 f"{side}_betas": np.broadcast_to(_betas(hand), (clip.n_frames, 10)),
             }
-        found |= {"object_translation_m": track.translation_m, "object_hinge_rad": hinge_of(track)}
-        found["object_quaternion_xyzw"] = continuous_quaternions(track.rotvec)
-        return {column.name: np.ascontiguousarray(found[column.name], column.dtype) for column in COLUMNS}
+        arrays |= {"object_translation_m": track.translation_m, "object_hinge_rad": hinge_of(track)}
+        arrays["object_quaternion_xyzw"] = continuous_quaternions(track.rotvec)
+        return {column.name: np.ascontiguousarray(arrays[column.name], column.dtype) for column in COLUMNS}
 
     def clip_arrays(self) -> dict[str, np.ndarray]:
         """The arrays of ``CLIP_COLUMNS``, in their order."""
-        found: dict[str, Any] = {"gravity": np.full(3, np.nan) if self.clip.gravity is None else self.clip.gravity}
+        arrays: dict[str, Any] = {"gravity": np.full(3, np.nan) if self.clip.gravity is None else self.clip.gravity}
         for side in SIDES:
             template_m = self.clip.hands[side].template_m
-            found[f"{side}_template_m"] = np.zeros((0, 3)) if template_m is None else template_m
-        return {column.name: np.ascontiguousarray(found[column.name], column.dtype) for column in CLIP_COLUMNS}
+            arrays[f"{side}_template_m"] = np.zeros((0, 3)) if template_m is None else template_m
+        return {column.name: np.ascontiguousarray(arrays[column.name], column.dtype) for column in CLIP_COLUMNS}
 
 
 def file_name_of(label: str) -> str:
-    """A clip's id or an object's name as the name of one file: ``a/b`` becomes ``a__b``, odd characters ``%..``.
+    """A clip id or object name as a file name: ``a/b`` becomes ``a__b``, special characters ``%..``.
 
-    Different labels have different names, and none leaves the folder: labels are text of foreign files.
+    Different labels get different names, and no name leaves the folder, since labels are text of untrusted files.
     """
-    parts = [_ODD.sub(lambda found: f"%{ord(found.group()):02X}", part) for part in label.split("/")]
+    parts = [_ESCAPED.sub(lambda match: f"%{ord(match.group()):02X}", part) for part in label.split("/")]
     name = "__".join(parts)
-    if len(name.encode()) > LONGEST_NAME:
-        name = f"{name.encode()[:LONGEST_NAME].decode(errors='ignore')}-{sha256(label.encode()).hexdigest()[:12]}"
+    if len(name.encode()) > MAX_NAME_BYTES:
+        name = f"{name.encode()[:MAX_NAME_BYTES].decode(errors='ignore')}-{sha256(label.encode()).hexdigest()[:12]}"
     return name
 
 
-def _held(track: HandTrack, joints_m: np.ndarray) -> tuple[HandTrack, np.ndarray]:
-    """A hand and its joints that keep the last tracked pose; zeros if it is never tracked, as no pose is known."""
+def _filled_untracked(track: HandTrack, joints_m: np.ndarray) -> tuple[HandTrack, np.ndarray]:
+    """A hand and its joints with the last tracked pose in untracked frames; zeros if it is never tracked."""
     if track.valid.any():
         return track.held(), joints_m[track.shown_frames]
     poses = (track.wrist_m, track.global_orient, track.hand_pose)
@@ -172,7 +161,7 @@ def _held(track: HandTrack, joints_m: np.ndarray) -> tuple[HandTrack, np.ndarray
 
 
 def _betas(hand: HandTrack) -> np.ndarray:
-    """The shape coefficients. Zeros beside a personal rest mesh would be read as MANO's mean hand: they become NaN."""
+    """The shape coefficients; NaN with a personal rest mesh, where zeros would be read as MANO's mean hand."""
     return np.full_like(hand.betas, np.nan) if hand.template_m is not None and not hand.betas.any() else hand.betas
 
 
@@ -182,9 +171,11 @@ def hinge_of(track: ObjectTrack) -> np.ndarray:
 
 
 class Source:
-    """A store to be exported: its clips, with the sentences and subsets of the stages' folders beside it, if any.
+    """The clips of a store, with sentences and subsets from the folders of the stages next to it, if present.
 
-    clip_ids: those to export, by default all.
+    Args:
+        store: the store of clips.
+        clip_ids: the clips to export; empty for all.
     """
 
     def __init__(self, store: Store, clip_ids: tuple[str, ...] = ()) -> None:
@@ -195,28 +186,32 @@ class Source:
         self.ids = sorted(clip_ids or store.ids, key=self._subset_order)
 
     def clip(self, clip_id: str) -> ExportedClip:
-        """One clip with its joints and words."""
+        """One clip with its joints and sentences."""
         clip = self.store.clip(clip_id, motion_only=True)
         hands, joints = dict(clip.hands), {}
         for side in SIDES:
-            hands[side], joints[side] = _held(hands[side], self.store.joints(clip_id, side))
-        words = self._sentences.get(clip_id) or [f"{clip.verb} the {clip.object_words}" if clip.verb else ""]
+            hands[side], joints[side] = _filled_untracked(hands[side], self.store.joints(clip_id, side))
+        sentences = self._sentences.get(clip_id) or [f"{clip.verb} the {clip.object_words}" if clip.verb else ""]
         return ExportedClip(
-            replace(clip, hands=hands), joints, self.store.hand_pair(), tuple(map(str, words)), self.subset(clip_id)
+            replace(clip, hands=hands),
+            joints,
+            self.store.hand_pair(),
+            sentences=tuple(map(str, sentences)),
+            subset=self.subset(clip_id),
         )
 
     def subset(self, clip_id: str) -> str:
-        """train, validation or test; empty for a clip in none."""
-        found = self._subsets.get(clip_id, [None])[0]
-        return found if found in SUBSETS else ""
+        """train, validation or test; empty if the clip is in none."""
+        subset = self._subsets.get(clip_id, [None])[0]
+        return subset if subset in SUBSETS else ""
 
     def _subset_order(self, clip_id: str) -> int:
-        """Clips of a subset follow each other; otherwise the order is the store's."""
+        """Sort key: clips of a subset follow each other, in the order of the store."""
         return [*SUBSETS, ""].index(self.subset(clip_id))
 
 
 def _grouped(path: Path, column: str) -> dict[str, list[Any]]:
-    """The values of a column by clip id, in the table's order; none without the file."""
+    """The values of a column by clip id, in the table's order; empty if the file does not exist."""
     if not path.is_file():
         return {}
     rows = read_table(path, ["clip_id", column])
@@ -224,7 +219,7 @@ def _grouped(path: Path, column: str) -> dict[str, list[Any]]:
 
 
 def state_names(side: Side) -> list[str]:
-    """Names of the 63 numbers of one hand's joints."""
+    """Names of the 63 joint coordinates of one hand."""
     return [f"{side}.{joint}.{axis}" for joint in JOINT_NAMES for axis in "xyz"]
 
 
@@ -232,7 +227,7 @@ _ARROW = {"float32": pa.float32(), "int32": pa.int32(), "int64": pa.int64(), "bo
 
 
 def row_type(column: Column) -> pa.DataType:
-    """The Arrow type of one frame: a value, or lists; of a fixed length but for -1, which pyarrow too takes for any."""
+    """The Arrow type of one frame: a value or nested lists of fixed length; -1 means any length."""
     kind: pa.DataType = _ARROW[column.dtype]
     for length in reversed(column.shape):
         kind = pa.list_(kind, length)

@@ -1,8 +1,8 @@
-"""USD: per clip one stage with the hands' and objects' meshes moving, in metres, y up.
+"""USD: per clip a stage with animated meshes of hands and objects, in metres, y up.
 
-``/world`` turns the clip's world so that gravity is -y. Hands are meshes with points per frame (pose correctives and
-personal shape in them), their 21 joints point prims; objects are meshes below a transform per frame, the moving part
-about its hinge.
+``/world`` rotates the clip's world so that gravity is -y. A hand is a mesh with points per frame, which include pose
+correctives and personal shape, and its 21 joints are a point prim. An object is a mesh below a transform per frame; its
+moving part has a second transform about the hinge.
 """
 
 from collections.abc import Iterable
@@ -35,7 +35,7 @@ def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
 
 @cache
 def _usd(module: str) -> Any:
-    """A module of usd-core, whose type stubs name nothing that is in it."""
+    """Import a module of usd-core as Any, since its type stubs are empty."""
     try:
         return import_module(f"pxr.{module}")
     except ImportError as error:
@@ -72,11 +72,11 @@ def _add_hand(stage: Any, item: ExportedClip, side: Side) -> None:
     for frame in range(track.n_frames):
         mesh.GetPointsAttr().Set(_points(vertices[frame]), frame)
         joints.GetPointsAttr().Set(_points(item.joints[side][frame]), frame)
-    words = _usd("UsdGeom").Tokens
+    tokens = _usd("UsdGeom").Tokens
     for prim in (mesh, joints):
-        seen = prim.CreateVisibilityAttr()
+        visibility = prim.CreateVisibilityAttr()
         for frame in np.flatnonzero(np.diff(track.valid, prepend=~track.valid[:1])):
-            seen.Set(words.inherited if track.valid[frame] else words.invisible, int(frame))
+            visibility.Set(tokens.inherited if track.valid[frame] else tokens.invisible, int(frame))
 
 
 def _add_object(stage: Any, path: str, track: ObjectTrack) -> None:
@@ -85,8 +85,8 @@ def _add_object(stage: Any, path: str, track: ObjectTrack) -> None:
     _part_mesh(stage, f"{path}/base", model.vertices_m, model.faces_of(0), OBJECT_COLOUR)
     if model.hinge is None:
         return
-    turn = model.hinge.axis * hinge_of(track)[:, None]
-    _transform(stage, f"{path}/moving_part", np.broadcast_to(model.hinge.origin_m, turn.shape), turn)
+    rotvec = model.hinge.axis * hinge_of(track)[:, None]
+    _transform(stage, f"{path}/moving_part", np.broadcast_to(model.hinge.origin_m, rotvec.shape), rotvec)
     vertices = model.vertices_m - model.hinge.origin_m
     _part_mesh(stage, f"{path}/moving_part/mesh", vertices, model.faces_of(1), MOVING_PART_COLOUR)
 
@@ -106,18 +106,18 @@ def _mesh(stage: Any, path: str, vertices_m: np.ndarray, faces: np.ndarray, colo
     return mesh
 
 
-def _points(places_m: np.ndarray) -> Any:
-    return _usd("Vt").Vec3fArray.FromNumpy(np.ascontiguousarray(places_m, np.float32))
+def _points(points_m: np.ndarray) -> Any:
+    return _usd("Vt").Vec3fArray.FromNumpy(np.ascontiguousarray(points_m, np.float32))
 
 
-def _transform(stage: Any, path: str, places_m: np.ndarray, rotvec: np.ndarray) -> Any:
-    """A prim whose children move: (frame, 3) places and axis-angles; one frame stands still."""
+def _transform(stage: Any, path: str, translation_m: np.ndarray, rotvec: np.ndarray) -> Any:
+    """Add a transform with (frame, 3) translations and axis-angles; a single frame gives a static transform."""
     xform = _usd("UsdGeom").Xform.Define(stage, path)
     double = _usd("UsdGeom").XformOp.PrecisionDouble
-    move, turn = xform.AddTranslateOp(double), xform.AddOrientOp(double)
+    translate, orient = xform.AddTranslateOp(double), xform.AddOrientOp(double)
     quaternions = continuous_quaternions(rotvec)
-    for frame, (place, (x, y, z, w)) in enumerate(zip(places_m.tolist(), quaternions.tolist(), strict=True)):
-        time = _usd("Usd").TimeCode.Default() if len(places_m) == 1 else _usd("Usd").TimeCode(frame)
-        move.Set(_usd("Gf").Vec3d(*place), time)
-        turn.Set(_usd("Gf").Quatd(w, x, y, z), time)
+    for frame, (position, (x, y, z, w)) in enumerate(zip(translation_m.tolist(), quaternions.tolist(), strict=True)):
+        time = _usd("Usd").TimeCode.Default() if len(translation_m) == 1 else _usd("Usd").TimeCode(frame)
+        translate.Set(_usd("Gf").Vec3d(*position), time)
+        orient.Set(_usd("Gf").Quatd(w, x, y, z), time)
     return xform.GetPrim()

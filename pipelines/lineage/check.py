@@ -1,9 +1,9 @@
-"""Every byte looked at again: outputs against dvc.lock, checkpoints against seals, raw files against manifests.
+"""Hash all files again: outputs against dvc.lock, checkpoints against their checksums, raw files against manifests.
 
-What a whole run made is also kept as a small table that is committed: by it a clone proves that it made the same.
-dvc.lock names the digests of all code, so every edit changes it, and of networks, whose last bits depend on the
-processor. The table has the outputs of the data stages by DVC's digest, which are the same on every x86-64 processor
-with AVX2 (``hoidata.processor``), and the networks by the digest of their weights alone, with the processor.
+A digest table records the outputs of a whole run. It is committed, so that a clone can check that it gives the same
+results. dvc.lock does not serve for this: it contains digests of all code. The table has DVC's digests of the data
+stages' outputs, which are equal on every x86-64 processor with AVX2 (``hoidata.processor``). Of networks it has the
+digests of the weights, whose last bits depend on the processor, and the processor's name.
 """
 
 import json
@@ -26,46 +26,46 @@ SHOWN = 5
 
 
 def check(root: Path, target: Target | None = None) -> list[Node]:
-    """One node per output, checkpoint and raw folder behind ``target``, or of all that was ever run here."""
+    """One node per output, checkpoint and raw folder upstream of a target; without a target, of all stages that ran."""
     locks = read_locks(root)
-    behind = target.record["stages"] if target and target.kind != "motion" else locks
-    outs = {path: locks[name] for name in locks.keys() & behind.keys() for path in locks[name].outs}
-    outs.pop("code", None)  # written anew by every run
-    return [node for path in sorted(outs) for node in _checked(root, path, outs[path])]
+    upstream = target.record["stages"] if target and target.kind != "motion" else locks
+    outs = {path: locks[name] for name in locks.keys() & upstream.keys() for path in locks[name].outs}
+    outs.pop("code", None)  # every run writes it again
+    return [node for path in sorted(outs) for node in _check_output(root, path, outs[path])]
 
 
-def _checked(root: Path, path: str, lock: Locked) -> Iterator[Node]:
+def _check_output(root: Path, path: str, lock: Locked) -> Iterator[Node]:
     if not (root / path).exists():
         yield Node("data", path, "missing", "noted in dvc.lock")
         return
     others = other_files(root, lock, path)
-    detail = f"not what dvc.lock says: {_some(others)}" if others else ""
+    detail = f"differs from dvc.lock: {_shortened(others)}" if others else ""
     yield Node("data", path, "tampered" if others else "same", detail)
     for file in sorted((root / path).rglob("*.safetensors")):
-        yield _sealed(file, file.relative_to(root).as_posix())
+        yield _check_checksum(file, file.relative_to(root).as_posix())
     listed = raw_list(root, path)
     if listed is not None and listed.files:
-        yield _raw(root, path)
+        yield _check_raw(root, path)
 
 
-def _some(names: list[str]) -> str:
+def _shortened(names: list[str]) -> str:
     return ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
 
 
-def _sealed(file: Path, name: str) -> Node:
+def _check_checksum(file: Path, name: str) -> Node:
     try:
         fault = seal_fault(file)
     except BadInput:
         fault = "header"
     return (
-        Node("checkpoint", name, "tampered", f"the {fault} are not what was written")
+        Node("checkpoint", name, "tampered", f"the {fault} differ from their checksum")
         if fault
         else Node("checkpoint", name, "same")
     )
 
 
-def _raw(root: Path, path: str) -> Node:
-    """The raw files of one dataset, read again."""
+def _check_raw(root: Path, path: str) -> Node:
+    """Hash the raw files of one dataset and compare them with its manifest."""
     from pipelines.lineage.manifests import read_manifest, verify_files  # imports adapters
 
     listed, manifest = raw_list(root, path), read_manifest(root / path)
@@ -84,7 +84,7 @@ SCHEMA = "hoidata.made/1"
 
 
 def write_made(root: Path, profile: str, path: Path) -> Path:
-    """Write the table of what lies here, which is to be what the last run made (``hoidata lineage check``)."""
+    """Write the digest table of a profile's outputs; run ``check`` first, so that they are those of the last run."""
     outs = sorted(out for lock in read_locks(root).values() for out in lock.outs if out.startswith(f"data/{profile}/"))
     if not outs:
         raise BadInput(root / "dvc.lock", f"a run of the profile {profile}", "none", "run `hoidata repro` first")
@@ -100,34 +100,41 @@ def write_made(root: Path, profile: str, path: Path) -> Path:
 
 
 def compare_made(root: Path, path: Path) -> list[Node]:
-    """One node per entry of a table, against what lies here.
+    """Compare the outputs here with a digest table; one node per entry.
 
-    A network of other weights is no fault where another processor or library made it, and is ``recorded`` then.
+    A network with other weights has the status ``recorded`` if its processor or libraries differ, since these change
+    the last bits.
     """
     table = read_json(path)
     if table["schema"] != SCHEMA:
-        raise BadInput(path, f"schema {SCHEMA}", str(table["schema"]), "take the one of this version")
+        raise BadInput(path, f"schema {SCHEMA}", str(table["schema"]), "use the table of this version")
     table.check({"outputs": dict, "networks": dict, "processor": str, "libraries": dict})
     nodes = [_node("data", root, name, digest, dvc_digest(root / name)) for name, digest in table["outputs"].items()]
-    elsewhere = "; ".join(_other_circumstances(table))
+    environment = "; ".join(_environment_differences(table))
     for name, digest in table["networks"].items():
-        found = payload_digest(root / name) if (root / name).is_file() else None
-        node = _node("checkpoint", root, name, digest, found)
-        is_excused = node.status == "changed" and elsewhere
-        nodes.append(Node("checkpoint", name, "recorded", elsewhere) if is_excused else node)
+        digest_here = payload_digest(root / name) if (root / name).is_file() else None
+        node = _node("checkpoint", root, name, digest, digest_here)
+        is_excused = node.status == "changed" and environment
+        nodes.append(Node("checkpoint", name, "recorded", environment) if is_excused else node)
     return nodes
 
 
-def _node(kind: Any, root: Path, name: str, digest: str | None, found: str | None) -> Node:
-    if found is None:
-        return Node(kind, name, "missing", "listed, not here")
-    return Node(kind, name, "same") if found == digest else Node(kind, name, "changed", "not the bytes that are listed")
+def _node(kind: Any, root: Path, name: str, expected: str | None, digest_here: str | None) -> Node:
+    if digest_here is None:
+        return Node(kind, name, "missing", "in the table, but not here")
+    return (
+        Node(kind, name, "same") if digest_here == expected else Node(kind, name, "changed", "differs from the table")
+    )
 
 
-def _other_circumstances(table: dict[str, Any]) -> list[str]:
-    here = {"processor": processor_name(), **library_versions()}
-    then = {"processor": table["processor"], **table["libraries"]}
-    return [f"{name} {then.get(name)} there, {value} here" for name, value in here.items() if then.get(name) != value]
+def _environment_differences(table: dict[str, Any]) -> list[str]:
+    current = {"processor": processor_name(), **library_versions()}
+    recorded = {"processor": table["processor"], **table["libraries"]}
+    return [
+        f"{name} {recorded.get(name)} there, {value} here"
+        for name, value in current.items()
+        if recorded.get(name) != value
+    ]
 
 
 def _networks(root: Path, profile: str) -> list[str]:

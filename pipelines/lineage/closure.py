@@ -1,6 +1,6 @@
-"""The exact code behind a module: every file its imports reach, those inside functions too, and the data beside them.
+"""The import closure of a module: all files its imports reach, also imports in functions, and the packages' data files.
 
-Imports are read from the source and nothing is run; what a module picks by name is told in a ``Choice``.
+Imports are parsed from the source; no code runs. A ``Choice`` states what a module imports or reads dynamically.
 """
 
 import ast
@@ -17,78 +17,84 @@ from pathlib import Path
 from hoidata.files.atomic import sha256_file, write_whole
 from hoidata.package_paths import INSTALLED, package_home
 
-# An import statement: the module after ``from`` or None, how many folders up, the names.
+# An import statement: the module after ``from`` or None, the number of leading dots, the names.
 Statement = tuple[str | None, int, list[str]]
-KNOWN_IMPORTS = Path(".hoidata/imports.json")
+CACHED_IMPORTS = Path(".hoidata/imports.json")
 OWN_PACKAGES = ("hoidata", "models", "pipelines")
 ENTRY_POINT_GROUPS = ("hoidata.adapters", "hoidata.families")
-# Lie in packages, and no module reads them.
+# Files in packages that no module reads.
 NOT_DATA = ("*.py", "*.pyc", "*.md", "dvc.yaml", "dvc.lock", ".*")
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What one module picks by name: modules it imports and, as glob patterns in a package's folder, files it reads.
+    """The modules and files that a module selects at run time, such as the adapter of one dataset."""
 
-    is_table: the module names much that is not picked here, so its own text does not count, only what it picks.
-    """
-
-    modules: tuple[str, ...] = ()
-    package: str = ""
-    files: tuple[str, ...] = ()
-    is_table: bool = False
+    modules: tuple[str, ...] = ()  # imported by name
+    package: str = ""  # in whose folder ``files`` are
+    files: tuple[str, ...] = ()  # glob patterns of files that are read
+    is_registry: bool = False  # the module lists more than is selected, so its text does not count, only the selection
 
 
 class SourceTree:
-    """The packages of the project at ``root`` and those that entry points add; each file is read once.
+    """The source files of the project's packages and of packages with entry points; each file is read once.
 
-    outside: packages whose folder lies elsewhere, by name (``hoidata.datasets.kitchen``). What a file imports is kept
-    by the file's digest in ``.hoidata``, which may be deleted: parsing it again takes ten times as long.
+    Parsed imports are cached in ``.hoidata`` by the digest of the file, since parsing takes ten times as long.
+
+    Args:
+        root: the project folder.
+        outside: folders of packages outside of the project, by name (``hoidata.datasets.kitchen``).
     """
 
     def __init__(self, root: Path, outside: Mapping[str, Path] | None = None) -> None:
         self._root, self._outside = root, outside or {}
-        self._known = _read_imports(root / KNOWN_IMPORTS)
-        self._used: dict[str, list[Statement]] = {}
+        self._cached_imports = _read_imports(root / CACHED_IMPORTS)
+        self._parsed_imports: dict[str, list[Statement]] = {}
         self._sources: dict[str, Path | None] = {}
         self._imports: dict[str, tuple[str, ...]] = {}
         self._data: dict[str, list[tuple[str, Path]]] = {}
         self._digests: dict[Path, str] = {}
 
     def closure(self, start: Iterable[str], chosen: Mapping[str, Iterable[Choice]]) -> dict[str, str]:
-        """SHA-256 of each file behind the modules ``start``, by its path as the import system sees it.
+        """SHA-256 of each file in the import closure, by its path as the import system sees it.
 
-        chosen: by module what it picks by name. A file that some module picks counts where that module is reached;
-        all other data files count with the package they lie in. Packages of others come with their version.
+        A data file that some choice names counts only if that choice's module is reached. All other data files count
+        with their package. Third-party packages with entry points are listed with their version.
+
+        Args:
+            start: names of the modules to begin with.
+            chosen: the run-time choices of modules, by module.
         """
         reached = self._reached(start, chosen)
         sources = {name: source for name in reached if (source := self._source(name))}
-        tables = {by for by, choices in chosen.items() if any(choice.is_table for choice in choices)}
-        found = {self._key(name, source): source for name, source in sources.items() if name not in tables}
-        picked = {by: dict(self._picked(choices)) for by, choices in chosen.items()}
-        claimed = {key for files in picked.values() for key in files}
+        registries = {module for module, choices in chosen.items() if any(choice.is_registry for choice in choices)}
+        files = {self._key(name, source): source for name, source in sources.items() if name not in registries}
+        picked = {module: dict(self._picked(choices)) for module, choices in chosen.items()}
+        claimed = {key for picked_files in picked.values() for key in picked_files}
         data = (item for name in sources for item in self._data_of(name))
-        found |= {key: path for key, path in data if key not in claimed}
-        for by in picked.keys() & sources.keys():
-            found |= picked[by]
-        digests = {key: self._digest(path) for key, path in found.items()}
+        files |= {key: path for key, path in data if key not in claimed}
+        for module in picked.keys() & sources.keys():
+            files |= picked[module]
+        digests = {key: self._digest(path) for key, path in files.items()}
         return digests | {key: version for name in sources for key, version in self._distribution(name).items()}
 
-    def keep_imports(self) -> None:
-        """Keep what was parsed for the next time, where that is new and can be written."""
-        path = self._root / KNOWN_IMPORTS
-        if path.parent.is_dir() and not self._used.keys() <= self._known.keys():
+    def save_imports(self) -> None:
+        """Write the cache of parsed imports if it has grown; a read-only folder is not an error."""
+        path = self._root / CACHED_IMPORTS
+        if path.parent.is_dir() and not self._parsed_imports.keys() <= self._cached_imports.keys():
             with suppress(OSError):
-                write_whole(path, json.dumps({"scanner": _scanner(), "imports": self._known | self._used}))
+                write_whole(
+                    path, json.dumps({"scanner": _scanner(), "imports": self._cached_imports | self._parsed_imports})
+                )
 
     def modules_below(self, package: str) -> list[str]:
-        """All modules of a package of the project, sorted; none where there is no such folder."""
+        """The names of all modules in a package, sorted; empty if there is no such folder."""
         folder = self._folder(package)
         paths = sorted(folder.rglob("*.py")) if folder else ()
         names = (".".join((package, *path.relative_to(folder).with_suffix("").parts)) for path in paths if folder)
         return [name.removesuffix(".__init__") for name in names]
 
-    def added(self, group: str, name: str) -> list[str]:
+    def entry_point_modules(self, group: str, name: str) -> list[str]:
         """The modules that other packages register under ``name``."""
         return [point.module for point in self._entry_points if (point.group, point.name) == (group, name)]
 
@@ -98,13 +104,13 @@ class SourceTree:
         while waiting:
             name = waiting.pop()
             picked = (module for choice in chosen.get(name, ()) for module in choice.modules)
-            new = [found for found in (*self._imported(name), *picked) if found not in order]
+            new = [imported for imported in (*self._imported(name), *picked) if imported not in order]
             order.update(dict.fromkeys(new))
             waiting += new
         return sorted(order)
 
     def _imported(self, name: str) -> tuple[str, ...]:
-        """The packages a module lies in and all that its imports name, also what turns out to be no module."""
+        """The parent packages of a module and all names in its imports, some of which are not modules."""
         if name not in self._imports:
             source = self._source(name)
             statements = self._statements(source) if source else ()
@@ -117,13 +123,13 @@ class SourceTree:
 
     def _statements(self, source: Path) -> list[Statement]:
         digest = self._digest(source)
-        if digest not in self._used:
-            known = self._known.get(digest)
-            self._used[digest] = list(_imports(ast.parse(source.read_bytes()))) if known is None else known
-        return self._used[digest]
+        if digest not in self._parsed_imports:
+            cached = self._cached_imports.get(digest)
+            self._parsed_imports[digest] = list(_imports(ast.parse(source.read_bytes()))) if cached is None else cached
+        return self._parsed_imports[digest]
 
     def _folder(self, package: str) -> Path | None:
-        """Where the files of a package lie, if it is one that counts; also of a package that is a single module."""
+        """The folder of a package; for a module, the path without suffix. None for packages that do not count."""
         for name, folder in self._outside.items():
             if package == name or package.startswith(f"{name}."):
                 return folder.joinpath(*package.removeprefix(name).split(".")[1:])
@@ -131,7 +137,7 @@ class SourceTree:
         return home.joinpath(*package.split(".")) if home else None
 
     def _source(self, name: str) -> Path | None:
-        """The file of a module that counts; None for others and for what is no module."""
+        """The source file of a module; None for packages that do not count and for names that are not modules."""
         if name not in self._sources:
             base = self._folder(name)
             candidates = (base / "__init__.py", base.with_suffix(".py")) if base else ()
@@ -140,7 +146,7 @@ class SourceTree:
 
     @cached_property
     def _homes(self) -> dict[str, Path]:
-        """The folder each package lies in: the project, or where a package of others is installed."""
+        """The parent folder of each top-level package: the project, or the place where it is installed."""
         homes: dict[str, Path] = {name: package_home(name, self._root) for name in OWN_PACKAGES}
         for point in self._entry_points:
             top = point.module.partition(".")[0]
@@ -156,7 +162,7 @@ class SourceTree:
         return [point for group in ENTRY_POINT_GROUPS for point in points.select(group=group)]
 
     def _distribution(self, name: str) -> dict[str, str]:
-        """Name and version of the package of others that a module belongs to."""
+        """Name and version of the third-party distribution that a module belongs to."""
         top = name.partition(".")[0]
         points = () if top in OWN_PACKAGES else self._entry_points
         dists = [point.dist for point in points if point.dist and point.module.partition(".")[0] == top]
@@ -177,7 +183,7 @@ class SourceTree:
                 yield from ((_below(choice.package, folder, path), path) for path in paths)
 
     def _data_of(self, name: str) -> list[tuple[str, Path]]:
-        """The data files of a module's package: in its folder, and in folders below that hold no modules."""
+        """The data files of a module's package: in its folder, and in subfolders without modules."""
         source = self._source(name)
         package = name if source and source.name == "__init__.py" else name.rpartition(".")[0]
         if package not in self._data:
@@ -201,12 +207,13 @@ def _data_files(folder: Path) -> Iterator[Path]:
 
 
 def _read_imports(path: Path) -> dict[str, list[Statement]]:
-    """What was kept, by the digest of the file that imports it; nothing of what other code than this kept."""
+    """The cached imports by the digest of the source file; empty if another version of this module wrote them."""
     try:
         values = json.loads(path.read_bytes())
-        known = values["imports"] if values["scanner"] == _scanner() else {}
+        imports = values["imports"] if values["scanner"] == _scanner() else {}
         return {
-            digest: [(base, int(level), list(names)) for base, level, names in found] for digest, found in known.items()
+            digest: [(base, int(level), list(names)) for base, level, names in statements]
+            for digest, statements in imports.items()
         }
     except (OSError, ValueError, TypeError, AttributeError, KeyError):
         return {}
@@ -217,7 +224,7 @@ def _scanner() -> str:
 
 
 def _imports(tree: ast.AST) -> Iterator[Statement]:
-    """Every import statement, but for those that only a type checker follows."""
+    """All import statements except those for type checkers only."""
     waiting = [tree]
     while waiting:
         node = waiting.pop()
@@ -233,7 +240,7 @@ def _imports(tree: ast.AST) -> Iterator[Statement]:
 
 
 def _named(statement: Statement, package: str) -> list[str]:
-    """What a statement may import; of ``from a import b`` both, as b may be a module or something in a."""
+    """The modules that a statement may import; of ``from a import b`` both a and a.b, since b may be a module."""
     base, level, names = statement
     if base is None:
         return names

@@ -1,4 +1,4 @@
-"""What made two checkpoints (or other outputs) differ, in words: causes only, never what follows from them."""
+"""`hoidata lineage diff`: the causes of a difference between two checkpoints or other outputs, in words."""
 
 from pathlib import Path
 from typing import Any
@@ -6,27 +6,27 @@ from typing import Any
 from pipelines.lineage.raw import RawSource, raw_sources
 from pipelines.lineage.tree import value_changes
 
-# Facts of a record that are causes; others (clips_digest, vocabulary, ...) follow from the data.
+# Facts of a record that are causes. The others (clips_digest, vocabulary, ...) follow from the data.
 _CAUSES = ("device", "encoder", "hand_digest")
 _SEED = "train.seed"
 
 
 def differences(root: Path | None, first: dict[str, Any], second: dict[str, Any]) -> list[str]:
-    """The causes, one line each; none where nothing that is recorded differs."""
+    """The causes, one line each; empty if the records are equal."""
     pairs = _paired(first.get("stages", {}), second.get("stages", {}))
-    found = [line for name, (one, other) in pairs.items() for line in _stage_differences(name, one, other)]
-    found += _seed(first, second)
-    found += _facts(first, second)
-    found += _libraries(first.get("libraries", {}), second.get("libraries", {}))
-    found += _raw(raw_sources(root, first), raw_sources(root, second))
-    found = list(dict.fromkeys(found))
-    return found or _unexplained(first, second, pairs)
+    causes = [line for name, (one, other) in pairs.items() for line in _stage_differences(name, one, other)]
+    causes += _seed(first, second)
+    causes += _facts(first, second)
+    causes += _libraries(first.get("libraries", {}), second.get("libraries", {}))
+    causes += _raw(raw_sources(root, first), raw_sources(root, second))
+    causes = list(dict.fromkeys(causes))
+    return causes or _unexplained(first, second, pairs)
 
 
 def _paired(first: dict[str, Any], second: dict[str, Any]) -> dict[str, tuple[dict | None, dict | None]]:
-    """The stages of both, by name; where the datasets are others, by what they do."""
+    """The stages of both records by name; without a common name, by kind (``train``, ``convert``)."""
     if not first.keys() & second.keys():
-        first, second = ({_kind(name): stage for name, stage in of.items()} for of in (first, second))
+        first, second = ({_kind(name): stage for name, stage in stages.items()} for stages in (first, second))
     return {name: (first.get(name), second.get(name)) for name in dict.fromkeys([*first, *second])}
 
 
@@ -36,7 +36,7 @@ def _kind(stage: str) -> str:
 
 def _stage_differences(name: str, one: dict | None, other: dict | None) -> list[str]:
     if one is None or other is None:
-        return [f"stage {name}: only behind the {'second' if one is None else 'first'}"]
+        return [f"stage {name}: only in the {'second' if one is None else 'first'}"]
     return [*_params(name, one["params"], other["params"]), *_code(one["code"], other["code"]), *_manifests(one, other)]
 
 
@@ -47,27 +47,28 @@ def _params(stage: str, one: dict[str, Any], other: dict[str, Any]) -> list[str]
 
 
 def _code(one: dict[str, str], other: dict[str, str]) -> list[str]:
-    words = {path: _word(one.get(path), other.get(path)) for path in sorted({*one, *other})}
-    return [f"{'setting' if ' ' in path else 'code'} {path}: {word}" for path, word in words.items() if word]
+    changes = {path: _change(one.get(path), other.get(path)) for path in sorted({*one, *other})}
+    return [f"{'setting' if ' ' in path else 'code'} {path}: {word}" for path, word in changes.items() if word]
 
 
-def _word(one: Any, other: Any) -> str:
-    """How the second differs from the first."""
+def _change(one: Any, other: Any) -> str:
+    """How the second value differs from the first."""
     if one == other:
         return ""
     return "only in the first" if other is None else "only in the second" if one is None else "differs"
 
 
 def _manifests(one: dict, other: dict) -> list[str]:
-    """Inputs that no stage makes."""
+    """Differences of manifests, the inputs that no stage writes."""
     inputs = (
-        {path: digest for path, digest in of["inputs"].items() if path.startswith("manifests/")} for of in (one, other)
+        {path: digest for path, digest in record["inputs"].items() if path.startswith("manifests/")}
+        for record in (one, other)
     )
     first, second = inputs
     return [
         f"manifest {path}: {word}"
         for path in sorted({*first, *second})
-        if (word := _word(first.get(path), second.get(path)))
+        if (word := _change(first.get(path), second.get(path)))
     ]
 
 
@@ -80,12 +81,12 @@ def _seed(first: dict[str, Any], second: dict[str, Any]) -> list[str]:
 
 
 def _facts(first: dict[str, Any], second: dict[str, Any]) -> list[str]:
-    found = []
+    lines = []
     for key in _CAUSES:
         if key == "encoder" and _encoder_param(first) != _encoder_param(second):
-            continue  # said of the param
-        found += [f"{key}: {change}" for change in value_changes(first.get(key), second.get(key))]
-    return [line.replace(": value: ", ": ") for line in found]
+            continue  # reported as a param
+        lines += [f"{key}: {change}" for change in value_changes(first.get(key), second.get(key))]
+    return [line.replace(": value: ", ": ") for line in lines]
 
 
 def _encoder_param(record: dict[str, Any]) -> Any:
@@ -98,29 +99,33 @@ def _libraries(one: dict[str, str], other: dict[str, str]) -> list[str]:
 
 
 def _raw(one: list[RawSource], other: list[RawSource]) -> list[str]:
-    """Raw files that differ, and clips only one of them saw."""
-    first, second = ({path: digest for source in of for path, digest in source.digests.items()} for of in (one, other))
-    words = {path: _word(first.get(path), second.get(path)) for path in sorted({*first, *second})}
-    changed = [f"raw file {path}: {word}" for path, word in words.items() if word]
+    """Raw files that differ; if none do, clips that only one record has."""
+    first, second = (
+        {path: digest for source in sources for path, digest in source.digests.items()} for sources in (one, other)
+    )
+    changes = {path: _change(first.get(path), second.get(path)) for path in sorted({*first, *second})}
+    changed = [f"raw file {path}: {word}" for path, word in changes.items() if word]
     if changed:
         return changed
-    seen, also = ({clip.clip_id for source in of for clip in source.clips} for of in (one, other))
-    return [f"clip {clip}: only in the first" for clip in sorted(seen - also)] + [
-        f"clip {clip}: only in the second" for clip in sorted(also - seen)
+    first_clips, second_clips = (
+        {clip.clip_id for source in sources for clip in source.clips} for sources in (one, other)
+    )
+    return [f"clip {clip}: only in the first" for clip in sorted(first_clips - second_clips)] + [
+        f"clip {clip}: only in the second" for clip in sorted(second_clips - first_clips)
     ]
 
 
 def _unexplained(
     first: dict[str, Any], second: dict[str, Any], pairs: dict[str, tuple[dict | None, dict | None]]
 ) -> list[str]:
-    """Data that differs though nothing it was made from does; else weights that do."""
+    """The first data that differs although all its recorded causes are equal; else weights that do."""
     for one, other in reversed([pair for pair in pairs.values() if None not in pair]):
         assert one is not None
         assert other is not None
         for path, digest in one["inputs"].items():
             if path in other["inputs"] and other["inputs"][path] != digest:
-                return [f"data {path}: differs, and nothing that is recorded of its making does"]
+                return [f"data {path}: differs, although all its recorded causes are equal"]
     weights = [record.get("seal", {}).get("payload_sha256") for record in (first, second)]
     if weights[0] != weights[1]:
-        return ["weights: differ, and nothing that is recorded of their making does"]
+        return ["weights: differ, although all their recorded causes are equal"]
     return []

@@ -1,4 +1,4 @@
-"""What a file, a folder or a piece of code is, by content: equal digests, equal content."""
+"""SHA-256 digests of files, folders and JSON values."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ COMPILED = {"__pycache__"}
 
 
 def path_digest(path: Path) -> str | None:
-    """SHA-256 of a file, or of a folder's sorted ``digest  relative path`` lines; None when there is nothing.
+    """SHA-256 of a file, or of a folder's sorted ``digest  relative path`` lines; None if the path does not exist.
 
     Compiled Python and hidden files do not count.
     """

@@ -1,4 +1,4 @@
-"""A lineage as a page, and in the forms of others: Mermaid and PROV-JSON, which come from the record alone."""
+"""Output formats of a lineage: HTML page, Mermaid and PROV-JSON."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,33 +18,34 @@ _BAD_COLOUR = "#fadbd8"
 
 @dataclass(frozen=True)
 class Step:
-    """One run of a stage. inputs and outputs: digest with its algorithm, by path."""
+    """One run of a stage."""
 
     name: str
     params: dict[str, Any]
     code_digest: str
-    inputs: dict[str, str]
-    outputs: dict[str, str]
+    inputs: dict[str, str]  # path: algorithm and digest
+    outputs: dict[str, str]  # path: algorithm and digest
 
 
 def steps(tree: Node, record: dict[str, Any]) -> list[Step]:
-    """The runs behind a lineage, the last one first; a motion's is the one that generated it."""
+    """The stage runs of a lineage, latest first; for a motion, the run that generated it."""
     if tree.kind == "motion":
         inputs = {child.name: child.digest for child in tree.children}
-        return [Step("generate", {}, "", inputs, {tree.name: tree.digest})]
+        return [Step("generate", params={}, code_digest="", inputs=inputs, outputs={tree.name: tree.digest})]
     last = record["stage"]
     algorithm = "md5" if record.get("schema", "").startswith("hoidata.lock") else "sha256"
-    found = []
+    runs = []
     for name in _latest_first(record):
         stage = record["stages"][name]
         outputs = {tree.name: tree.digest} if name == last else _with(algorithm, stage.get("outputs", {}))
         inputs = _with(algorithm, stage["inputs"])
-        found.append(Step(name, stage["params"], value_digest(stage["code"]), inputs, outputs))
-    return found
+        code_digest = value_digest(stage["code"])
+        runs.append(Step(name, stage["params"], code_digest, inputs=inputs, outputs=outputs))
+    return runs
 
 
 def _latest_first(record: dict[str, Any]) -> list[str]:
-    """The stages so that each stands before those it is made from."""
+    """The stages in reverse topological order: each before its inputs."""
     stages = record["stages"]
     made_by = {path: name for name, stage in stages.items() for path in stage.get("outputs", ())}
     done: dict[str, None] = {}
@@ -64,7 +65,7 @@ def _with(algorithm: str, digests: dict[str, str | None]) -> dict[str, str]:
 
 
 def mermaid(tree: Node, record: dict[str, Any]) -> str:
-    """A flowchart: stages as boxes, files as rounded ones, coloured by what became of them."""
+    """A flowchart: stages as boxes, files as rounded boxes, coloured by status."""
     names: dict[str, str] = {}
     status = {node.name: node.status for node in tree.walk() if not node.repeated}
     boxes, arrows = [], []
@@ -85,12 +86,12 @@ def mermaid(tree: Node, record: dict[str, Any]) -> str:
 
 
 def _mermaid_text(text: str) -> str:
-    """Text in quotes: whatever is not plain goes as a character code."""
+    """Text for a quoted label; special characters become character codes."""
     return "".join(char if char.isalnum() or char in "/._-@: " else f"#{ord(char)};" for char in text)
 
 
 def prov(tree: Node, record: dict[str, Any]) -> dict[str, Any]:
-    """PROV-JSON: files are entities, runs activities, hoidata the agent; code is an entity of its own."""
+    """PROV-JSON: files and code are entities, runs are activities, hoidata is the agent."""
     document: dict[str, Any] = {
         "prefix": {"hoi": f"{PRODUCER}:", "prov": "http://www.w3.org/ns/prov#"},
         "entity": {},
@@ -105,15 +106,20 @@ def prov(tree: Node, record: dict[str, Any]) -> dict[str, Any]:
         document["activity"][activity] = {f"hoi:{key}": str(value) for key, value in step.params.items()}
         code = {_qualified("code", step.code_digest): ""} if step.code_digest else {}
         used = {_qualified("file", path): digest for path, digest in step.inputs.items()} | code
-        made = {_qualified("file", path): digest for path, digest in step.outputs.items()}
-        document["entity"] |= {name: {"hoi:digest": digest} if digest else {} for name, digest in (used | made).items()}
+        generated = {_qualified("file", path): digest for path, digest in step.outputs.items()}
+        document["entity"] |= {
+            name: {"hoi:digest": digest} if digest else {} for name, digest in (used | generated).items()
+        }
         links = (
             ("used", used, "prov:activity", "prov:entity"),
-            ("wasGeneratedBy", made, "prov:activity", "prov:entity"),
+            ("wasGeneratedBy", generated, "prov:activity", "prov:entity"),
         )
-        for relation, entities, of, what in links:
+        for relation, entities, activity_key, entity_key in links:
             for name in entities:
-                document[relation][f"_:{relation}{len(document[relation])}"] = {of: activity, what: name}
+                document[relation][f"_:{relation}{len(document[relation])}"] = {
+                    activity_key: activity,
+                    entity_key: name,
+                }
         document["wasAssociatedWith"][f"_:by{len(document['activity'])}"] = {
             "prov:activity": activity,
             "prov:agent": "hoi:hoidata",
@@ -126,8 +132,8 @@ def _qualified(kind: str, name: str) -> str:
 
 
 def write_lineage_page(path: Path, tree: Node, record: dict[str, Any], sources: Sequence[RawSource]) -> Path:
-    """Write a self-contained page; what is not as recorded stands open, all else is folded."""
-    from pipelines.pages.player import write_page  # imports what draws motions
+    """Write a self-contained page; nodes that differ from the record are expanded, all others are collapsed."""
+    from pipelines.pages.player import write_page  # imports the motion player
 
     status = overall_status(tree)
     stages = dict.fromkeys(node.name for node in tree.walk() if node.kind == "stage")

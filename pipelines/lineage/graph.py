@@ -1,4 +1,4 @@
-"""The stages as DVC resolves them from all dvc.yaml of the project."""
+"""The stages of all dvc.yaml files of the project, with matrices resolved."""
 
 import os
 import re
@@ -11,24 +11,24 @@ from typing import Any
 from hoidata.errors import BadInput
 from pipelines.params import load_yaml, read_file
 
-# What ``written_graph`` knows of a stage in dvc.yaml; DVC is asked where there is anything else.
+# The keys of a stage that ``written_graph`` understands; for any other key it falls back to DVC.
 _OUTS = ("outs", "metrics", "plots")
-_KNOWN = {"desc", "wdir", "matrix", "cmd", "deps", "params", *_OUTS, "always_changed", "frozen", "meta"}
+_KNOWN_KEYS = {"desc", "wdir", "matrix", "cmd", "deps", "params", *_OUTS, "always_changed", "frozen", "meta"}
 _REFERENCE = re.compile(r"\$\{([\w.]+)\}")
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of the graph, matrix resolved. name: as ``dvc repro`` takes it; paths relative to the project."""
+    """One stage of the graph, with its matrix resolved. Paths are relative to the project."""
 
-    name: str
+    name: str  # as ``dvc repro`` accepts it
     deps: tuple[str, ...]
     params: tuple[str, ...]
     outs: tuple[str, ...]
 
     @property
     def code(self) -> tuple[str, ...]:
-        """The files that hold the digests of the code this stage runs."""
+        """The files with the digests of the code this stage runs."""
         return tuple(path for path in self.deps if path.startswith("code/"))
 
     @property
@@ -38,18 +38,18 @@ class Stage:
 
 
 def look_up(values: dict[str, Any], dotted: str) -> Any:
-    """The value at a dotted key (``train.small.contact``). Raises BadInput naming the keys there are."""
-    found: Any = values
+    """The value at a dotted key (``train.small.contact``). Raises BadInput that lists the existing keys."""
+    value: Any = values
     for key in dotted.split("."):
-        if not isinstance(found, dict) or key not in found:
-            known = ", ".join(map(str, found)) if isinstance(found, dict) else "none"
-            raise BadInput(f"params.yaml: {dotted}", f"one of: {known}", key, "correct params.yaml")
-        found = found[key]
-    return found
+        if not isinstance(value, dict) or key not in value:
+            keys = ", ".join(map(str, value)) if isinstance(value, dict) else "none"
+            raise BadInput(f"params.yaml: {dotted}", f"one of: {keys}", key, "correct params.yaml")
+        value = value[key]
+    return value
 
 
 def read_graph(root: Path) -> dict[str, Stage]:
-    """All stages by name. Raises BadInput when DVC cannot read them."""
+    """All stages by name, as DVC reads them. Raises BadInput if it cannot."""
     from dvc.exceptions import DvcException
     from dvc.repo import Repo
 
@@ -62,7 +62,7 @@ def read_graph(root: Path) -> dict[str, Stage]:
 
 
 def written_graph(root: Path) -> dict[str, Stage]:
-    """What ``read_graph`` gives, in a tenth of the time: of what this project's dvc.yaml use, and else from DVC."""
+    """The result of ``read_graph`` in a tenth of the time; uses DVC only for keys that this module does not know."""
     params = read_file(root / "params.yaml")
     try:
         stages = [stage for file in _graph_files(root) for stage in _written(root, file, params)]
@@ -72,16 +72,16 @@ def written_graph(root: Path) -> dict[str, Stage]:
 
 
 def _graph_files(root: Path) -> list[str]:
-    found = (root / "dvc.yaml", *sorted(root.glob("models/*/dvc.yaml")), *root.glob("pipelines/dvc.yaml"))
-    return [path.relative_to(root).as_posix() for path in found]
+    files = (root / "dvc.yaml", *sorted(root.glob("models/*/dvc.yaml")), *root.glob("pipelines/dvc.yaml"))
+    return [path.relative_to(root).as_posix() for path in files]
 
 
 def _written(root: Path, file: str, params: dict[str, Any]) -> Iterator[Stage]:
-    """The stages of one dvc.yaml, matrix resolved. Raises ValueError for what is not understood here."""
+    """The stages of one dvc.yaml, with matrices resolved. Raises ValueError for unknown syntax."""
     stages = load_yaml((root / file).read_bytes())["stages"]
     prefix = "" if file == "dvc.yaml" else f"{file}:"
     for name, body in stages.items():
-        if unknown := body.keys() - _KNOWN:
+        if unknown := body.keys() - _KNOWN_KEYS:
             raise ValueError(f"{file}: {name}: {unknown}")
         base = Path(file).parent / body.get("wdir", ".")
         for item in _items(body.get("matrix") or {}, params):
@@ -92,14 +92,14 @@ def _written(root: Path, file: str, params: dict[str, Any]) -> Iterator[Stage]:
 
 
 def _items(matrix: dict[str, Any], params: dict[str, Any]) -> list[dict[str, str]]:
-    """The combinations of a matrix, as DVC numbers them."""
+    """The combinations of a matrix, in DVC's order."""
     lists = [values if isinstance(values, list) else look_up(params, values.strip("${}")) for values in matrix.values()]
     filled = [[_filled(str(value), params) for value in values] for values in lists]
     return [dict(zip(matrix, combination, strict=True)) for combination in product(*filled)]
 
 
 def _listed(body: dict[str, Any], keys: tuple[str, ...], values: dict[str, Any]) -> list[str]:
-    """The names in lists of a stage, with or without settings of their own, references filled in."""
+    """The entries of a stage's lists (plain or with options), with references filled in."""
     entries = [entry for key in keys for entry in body.get(key) or ()]
     names = [next(iter(entry)) if isinstance(entry, dict) else entry for entry in entries]
     return [_filled(name, values) for name in names]
@@ -117,12 +117,12 @@ def _below(base: Path, paths: list[str]) -> tuple[str, ...]:
 
 
 def producers(graph: dict[str, Stage]) -> dict[str, Stage]:
-    """Which stage makes each output path."""
+    """The stage that writes each output path."""
     return {out: stage for stage in graph.values() for out in stage.outs}
 
 
 def _stage(root: Path, stage: Any) -> Stage:
-    """DVC's own stage as one of ours."""
+    """Convert a stage of DVC."""
     file = Path(stage.path).relative_to(root).as_posix()
     name = stage.name if file == "dvc.yaml" else f"{file}:{stage.name}"
     paths = [dep for dep in stage.deps if not hasattr(dep, "params")]

@@ -1,4 +1,4 @@
-"""What DVC noted of every stage it ran: dvc.lock of the project and of its families, today or as of a commit."""
+"""The dvc.lock files of the project and its model families, in the working tree or in a commit."""
 
 import hashlib
 import json
@@ -15,46 +15,48 @@ from hoidata.files.written import md5_file
 from pipelines.params import load_yaml
 
 CACHE = Path(".dvc/cache/files/md5")
-# Neither DVC (.dvcignore) nor we count these: compiled code, and work under way or left by a killed run.
+# Ignored here and by DVC (.dvcignore): compiled code and unfinished files.
 _IGNORED = re.compile(r"__pycache__|.*\.pyc|\..*\.(work|part|old|lock)")
 
 
 @dataclass(frozen=True)
 class Locked:
-    """One run of a stage. deps and outs: MD5 by path (of a folder: of its listing, ending in ``.dir``)."""
+    """The entry of one stage in a dvc.lock: its last run."""
 
     name: str
     params: dict[str, Any] = field(default_factory=dict)
-    deps: dict[str, str] = field(default_factory=dict)
-    outs: dict[str, str] = field(default_factory=dict)
+    deps: dict[str, str] = field(default_factory=dict)  # MD5 by path; of a folder the MD5 of its listing, with ".dir"
+    outs: dict[str, str] = field(default_factory=dict)  # likewise
 
 
 def lock_files(root: Path) -> list[str]:
-    """The dvc.lock files there are, relative to the project."""
-    found = [root / "dvc.lock", *sorted(root.glob("models/*/dvc.lock"))]
-    return [path.relative_to(root).as_posix() for path in found if path.is_file()]
+    """The existing dvc.lock files, relative to the project."""
+    files = [root / "dvc.lock", *sorted(root.glob("models/*/dvc.lock"))]
+    return [path.relative_to(root).as_posix() for path in files if path.is_file()]
 
 
 def read_locks(root: Path, stage: str = "") -> dict[str, Locked]:
-    """The last run of every stage by its name; empty where nothing ever ran.
+    """The last run of each stage by name; empty before the first run.
 
-    stage: only what stands in the same file as this one, which is quicker.
+    Args:
+        root: the project folder.
+        stage: reads only the lock file that has this stage, which is faster; "" reads all.
     """
     file = stage.rpartition(":")[0].removesuffix("yaml") + "lock" if ":" in stage else "dvc.lock"
     return parse_locks({name: (root / name).read_bytes() for name in lock_files(root) if not stage or name == file})
 
 
 def parse_locks(texts: Mapping[str, bytes]) -> dict[str, Locked]:
-    """The stages of lock files given by their paths. Raises BadInput for a file DVC cannot have written."""
-    found = {}
+    """The stages in the contents of lock files, given by path. Raises BadInput for a malformed file."""
+    locks = {}
     for file, text in texts.items():
         prefix = "" if file == "dvc.lock" else f"{file.removesuffix('lock')}yaml:"
         try:
             stages = load_yaml(text)["stages"]
-            found |= {prefix + name: _locked(prefix + name, body) for name, body in stages.items()}
+            locks |= {prefix + name: _locked(prefix + name, body) for name, body in stages.items()}
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise BadInput(file, "a lock file of DVC", type(error).__name__, "run `dvc repro`") from error
-    return found
+    return locks
 
 
 def _locked(name: str, body: dict[str, Any]) -> Locked:
@@ -66,7 +68,7 @@ def _locked(name: str, body: dict[str, Any]) -> Locked:
 
 
 def dvc_digest(path: Path) -> str | None:
-    """The MD5 by which DVC knows a file or folder; None when there is nothing."""
+    """DVC's MD5 of a file or folder; None if it does not exist."""
     if path.is_file():
         return md5_file(path)
     if not path.is_dir():
@@ -75,19 +77,19 @@ def dvc_digest(path: Path) -> str | None:
 
 
 def _files_below(folder: Path) -> list[str]:
-    """The files that count, relative to the folder."""
+    """The files that are not ignored, relative to the folder."""
     names = [item.relative_to(folder) for item in folder.rglob("*") if item.is_file()]
     return [name.as_posix() for name in names if not any(map(_IGNORED.fullmatch, name.parts))]
 
 
 def listing_digest(entries: Mapping[str, str]) -> str:
-    """The MD5 by which DVC knows a folder of these files, given by path and MD5."""
+    """DVC's MD5 of a folder, from the MD5 of its files by path."""
     listing = [{"md5": entries[path], "relpath": path} for path in sorted(entries, key=lambda path: path.split("/"))]
     return hashlib.md5(json.dumps(listing, sort_keys=True).encode()).hexdigest() + ".dir"
 
 
 def cached_listing(root: Path, digest: str) -> dict[str, str]:
-    """MD5 of the files of a folder by path, where DVC's cache still knows that folder."""
+    """MD5 of the files of a folder by path, from DVC's cache; empty if the cache does not have it."""
     path = root / CACHE / digest[:2] / digest[2:]
     try:
         return {item["relpath"]: item["md5"] for item in json.loads(path.read_bytes())}
@@ -96,7 +98,7 @@ def cached_listing(root: Path, digest: str) -> dict[str, str]:
 
 
 def written_digest(path: Path) -> str | None:
-    """The MD5 a file had when its stage wrote it, by dvc.lock of the project it lies in; None where nobody knows."""
+    """The MD5 that a file had when its stage wrote it, from dvc.lock of its project; None if not recorded."""
     path = Path(os.path.abspath(path))
     root = next((folder for folder in path.parents if (folder / "dvc.lock").is_file()), None)
     if root is None:
@@ -111,19 +113,19 @@ def _written_digests(root: Path, _stamps: tuple[int, ...]) -> dict[str, str]:
 
 
 def written_files(root: Path, lock: Locked) -> dict[str, str]:
-    """MD5 by path of every file a stage wrote, as far as DVC's cache still lists its folders."""
-    found = {}
+    """MD5 by path of all files a stage wrote, if DVC's cache still has the listings of its folders."""
+    files = {}
     for out, md5 in lock.outs.items():
         if not md5.endswith(".dir"):
-            found[out] = md5
-        found |= {f"{out}/{name}": digest for name, digest in cached_listing(root, md5).items()}
-    return found
+            files[out] = md5
+        files |= {f"{out}/{name}": digest for name, digest in cached_listing(root, md5).items()}
+    return files
 
 
 def other_files(root: Path, lock: Locked, out: str) -> list[str]:
-    """The files of one output that are not those its stage wrote, missing and further ones too.
+    """The files of one output that its stage did not write like this: changed, missing and additional files.
 
-    The output itself where only that much is known.
+    The output itself if the cache has no listing of its files.
     """
     if dvc_digest(root / out) == lock.outs[out]:
         return []

@@ -1,7 +1,7 @@
-"""Manifests: which raw files a dataset consists of, without the files.
+"""Manifests: the list of a dataset's raw files, which DVC tracks instead of the files.
 
-A manifest is small public JSON (relative paths, sizes, SHA-256, licence) that stands for raw data DVC never sees.
-A folder of per-frame files is one entry, digested as ``RawTree.read_folder`` does.
+A manifest is a small public JSON file with relative paths, sizes, SHA-256 and the licence. A folder of per-frame files
+is one entry, with the digest of ``RawTree.read_folder``.
 """
 
 import json
@@ -27,22 +27,17 @@ NEVER_READ = re.compile(r"\.(png|jpe?g|mp4|avi|mkv|zip|tar|tgz|tar\.gz|part[a-z]
 
 @dataclass(frozen=True)
 class Manifest:
-    """One dataset of one profile.
-
-    present: False means the user does not have it: every stage of it is empty. source: ``generated`` from ``recipe``
-    (then everything made from it is synthetic) or the user's ``files``. files: empty in a committed recipe.
-    version: of the dataset's release. may_be_shared: the licence lets what is derived from it be passed on.
-    """
+    """The raw files of one dataset in one profile."""
 
     dataset: str
-    present: bool
-    source: Literal["generated", "files"]
+    present: bool  # False: the user does not have the dataset, and all its stages give empty outputs
+    source: Literal["generated", "files"]  # "generated" data is synthetic
     licence: str
     where_to_register: str = ""
-    version: str = ""
-    may_be_shared: bool = False
-    recipe: dict[str, Any] | None = None
-    files: tuple[SourceFile, ...] = ()
+    version: str = ""  # of the dataset's release
+    may_be_shared: bool = False  # whether the licence permits sharing derived data
+    recipe: dict[str, Any] | None = None  # seed and size of a generated corpus
+    files: tuple[SourceFile, ...] = ()  # empty in a committed manifest with a recipe
 
     @property
     def synthetic(self) -> bool:
@@ -57,7 +52,7 @@ class Manifest:
 
 
 def read_manifest(path: Path) -> Manifest:
-    """Read a manifest. Raises BadInput when it is missing, no JSON, or of another schema."""
+    """Read a manifest. Raises BadInput if it is missing, is not JSON, or has another schema."""
     try:
         values = json.loads(path.read_text())
     except FileNotFoundError as error:
@@ -82,7 +77,7 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def write_manifest(path: Path, manifest: Manifest) -> None:
-    """Write a manifest, one line per file entry so that version control shows which one changed."""
+    """Write a manifest, with one line per file entry for readable diffs."""
     head = {"schema": SCHEMA, **{key: value for key, value in asdict(manifest).items() if key != "files"}}
     lines = json.dumps(head, indent=2, ensure_ascii=False)[:-2]
     entries = ",\n    ".join(json.dumps(asdict(entry), ensure_ascii=False) for entry in manifest.files)
@@ -91,19 +86,34 @@ def write_manifest(path: Path, manifest: Manifest) -> None:
 
 
 def absent_manifest(adapter: Adapter) -> Manifest:
-    """The manifest of a dataset the user does not have (yet)."""
-    facts = {"version": adapter.version, "may_be_shared": adapter.may_be_shared}
-    return Manifest(adapter.name, False, "files", adapter.licence, adapter.where_to_register, **facts)
+    """The manifest of a dataset that the user does not have."""
+    return Manifest(
+        dataset=adapter.name,
+        present=False,
+        source="files",
+        licence=adapter.licence,
+        where_to_register=adapter.where_to_register,
+        version=adapter.version,
+        may_be_shared=adapter.may_be_shared,
+    )
 
 
-# The hand of a profile for which no MANO files were scanned.
-ABSENT_HAND = Manifest("hand", False, "files", "MANO: non-commercial research licence", "https://mano.is.tue.mpg.de")
+# The hand model of a profile without scanned MANO files.
+ABSENT_HAND = Manifest(
+    dataset="hand",
+    present=False,
+    source="files",
+    licence="MANO: non-commercial research licence",
+    where_to_register="https://mano.is.tue.mpg.de",
+)
 
 
 def scan_files(root: Path, parts: Sequence[DatasetPart] | None = None) -> tuple[SourceFile, ...]:
-    """Every raw file below ``root``, digested; images, videos and archives are passed over.
+    """Hash all raw files below ``root`` except images, videos and archives.
 
-    parts: only files that one of these parts names (``Adapter.parts``), so that what no adapter reads is not hashed.
+    Args:
+        root: the raw folder.
+        parts: restricts the scan to files of these parts (``Adapter.parts``); None scans all files.
     """
     patterns = ["**"] if parts is None else [pattern for part in parts for pattern in part.patterns]
     tree = RawTree(root)
@@ -117,21 +127,29 @@ def scan_files(root: Path, parts: Sequence[DatasetPart] | None = None) -> tuple[
 
 
 def _folders(root: Path, folder: str, patterns: list[tuple[str, ...]]) -> Iterator[tuple[str, list[str]]]:
-    """Each folder below root (as a relative path) with the sorted names of its data files that match a pattern.
+    """All folders below root, as relative paths, with the sorted names of their data files that match a pattern.
 
-    patterns: what is left of each below this folder, segment by segment; ``**`` stands for everything below.
+    Args:
+        root: the raw folder.
+        folder: the folder to walk, relative to root.
+        patterns: the remaining path segments of each glob pattern; ``**`` matches everything below.
     """
     entries = sorted(os.scandir(root / folder), key=lambda entry: entry.name)
     entries = [entry for entry in entries if not entry.name.startswith(".")]
     files = [entry.name for entry in entries if entry.is_file() and not NEVER_READ.search(entry.name)]
-    yield folder, [name for name in files if any(len(rest) == 1 and _fits(name, rest[0]) for rest in patterns)]
+    yield (
+        folder,
+        [name for name in files if any(len(segments) == 1 and _fits(name, segments[0]) for segments in patterns)],
+    )
     for entry in entries:
-        below = [rest if rest[0] == "**" else rest[1:] for rest in patterns if _fits(entry.name, rest[0])]
-        below = [rest for rest in below if rest]
-        # A link to a folder it lies in would never end.
-        endless = entry.is_symlink() and (root / folder).resolve().is_relative_to(Path(entry.path).resolve())
-        if below and entry.is_dir() and not endless:
-            yield from _folders(root, f"{folder}/{entry.name}" if folder else entry.name, below)
+        remaining = [
+            segments if segments[0] == "**" else segments[1:] for segments in patterns if _fits(entry.name, segments[0])
+        ]
+        remaining = [segments for segments in remaining if segments]
+        # A link to one of its parent folders would recurse forever.
+        is_recursive = entry.is_symlink() and (root / folder).resolve().is_relative_to(Path(entry.path).resolve())
+        if remaining and entry.is_dir() and not is_recursive:
+            yield from _folders(root, f"{folder}/{entry.name}" if folder else entry.name, remaining)
 
 
 def _fits(name: str, segment: str) -> bool:
@@ -139,31 +157,34 @@ def _fits(name: str, segment: str) -> bool:
 
 
 def missing_parts(adapter: Adapter, root: Path) -> list[DatasetPart]:
-    """The parts of a dataset of which nothing is below ``root``, required ones first."""
+    """The parts of a dataset without any file below ``root``, required parts first."""
     return sorted((part for part in adapter.parts if not part.is_in(root)), key=lambda part: part.optional)
 
 
 def part_of(adapter: Adapter, path: str) -> DatasetPart | None:
-    """The part of the dataset a manifest entry belongs to; a folder of frame files is known by its files."""
+    """The part of the dataset that a manifest entry belongs to, or None."""
     return next((part for part in adapter.parts if part.matches(path)), None)
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One entry that is not as the manifest says."""
+    """An entry that differs from the manifest."""
 
     path: str
     problem: Literal["missing", "changed", "unlisted"]
 
 
 def verify_files(root: Path, manifest: Manifest, parts: Sequence[DatasetPart] | None = None) -> list[Difference]:
-    """How the files below ``root`` differ from the manifest; an empty list when they are those it lists.
+    """The differences between the files below ``root`` and the manifest.
 
-    parts: as in ``scan_files``, and the same ones.
+    Args:
+        root: the raw folder.
+        manifest: the expected files.
+        parts: the same parts as for ``scan_files``.
     """
-    listed, found = manifest.by_path, {entry.path: entry for entry in scan_files(root, parts)}
-    differences = [Difference(path, "missing") for path in listed if path not in found]
-    differences += [Difference(path, "unlisted") for path in found if path not in listed]
-    both = listed.keys() & found.keys()
-    differences += [Difference(path, "changed") for path in both if listed[path].sha256 != found[path].sha256]
+    listed, present = manifest.by_path, {entry.path: entry for entry in scan_files(root, parts)}
+    differences = [Difference(path, "missing") for path in listed if path not in present]
+    differences += [Difference(path, "unlisted") for path in present if path not in listed]
+    both = listed.keys() & present.keys()
+    differences += [Difference(path, "changed") for path in both if listed[path].sha256 != present[path].sha256]
     return sorted(differences, key=lambda item: item.path)

@@ -1,6 +1,6 @@
-"""What a checkpoint carries about its making: only what follows from content, so that equal inputs give equal bytes.
+"""The provenance record in the header of a checkpoint: params, code, inputs and libraries.
 
-No time, host, user or commit is recorded; those would change the file's digest without changing what it is.
+It contains no time, host, user or commit, so that equal inputs give equal bytes.
 """
 
 from importlib.metadata import version
@@ -19,24 +19,28 @@ LIBRARIES = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl"
 
 
 def build_provenance(root: Path, stage_name: str, facts: dict[str, Any]) -> dict[str, Any]:
-    """The provenance of what ``stage_name`` is about to make from the working tree at ``root``.
+    """The provenance of the output that a stage is about to write.
 
-    facts: what the stage itself knows (model, config, seed, clips by split, synthetic). Every stage behind it is
-    recorded with the values of its params and the digests of its code, inputs and outputs; of the clips, the raw files
-    and frames they are.
+    It records the stage and all upstream stages, with the values of their params and the digests of code, inputs and
+    outputs, and the raw files and frames of the clips.
+
+    Args:
+        root: the project folder.
+        stage_name: the stage that calls this function.
+        facts: of the stage itself: model, config, seed, clips by subset, synthetic.
     """
     graph = written_graph(root)
     if stage_name not in graph:
         raise BadInput("dvc.yaml", f"a stage named {stage_name}", f"{len(graph)} others", "check params.yaml")
-    params, known = read_params(root), {}
-    behind = _stages_behind(graph, stage_name)
-    stages = {name: _record(root, graph[name], params, known) for name in behind}
+    params, digest_cache = read_params(root), {}
+    upstream = _upstream_stages(graph, stage_name)
+    stages = {name: _record(root, graph[name], params, digest_cache) for name in upstream}
     stages[stage_name].pop("outputs")
     return {
         "schema": SCHEMA,
         "stage": stage_name,
         **facts,
-        "params_digest": value_digest({name: stages[name]["params"] for name in behind}),
+        "params_digest": value_digest({name: stages[name]["params"] for name in upstream}),
         "code_digest": value_digest(stages[stage_name]["code"]),
         "libraries": library_versions(),
         "stages": stages,
@@ -45,28 +49,28 @@ def build_provenance(root: Path, stage_name: str, facts: dict[str, Any]) -> dict
 
 
 def _raw_facts(root: Path, facts: dict[str, Any], stages: dict[str, Any]) -> dict[str, Any]:
-    """The raw files and frames behind the clips, so that the header tells them where there is no store."""
-    from pipelines.lineage.raw import clips_of, read_raw, stores_behind
+    """The raw files and frames of the clips; the header has them for readers without the store."""
+    from pipelines.lineage.raw import clips_of, read_raw, upstream_stores
 
-    found = {path: read_raw(root, path, clips_of(facts)) for path in stores_behind({"stages": stages})}
-    return {path: source.as_json() for path, source in found.items() if source is not None}
+    sources = {path: read_raw(root, path, clips_of(facts)) for path in upstream_stores({"stages": stages})}
+    return {path: source.as_json() for path, source in sources.items() if source is not None}
 
 
-def _stages_behind(graph: dict[str, Stage], name: str) -> list[str]:
-    """The stage and all whose outputs it is made from, nearest first, each once."""
-    made_by, order = producers(graph), [name]
+def _upstream_stages(graph: dict[str, Stage], name: str) -> list[str]:
+    """The stage and all upstream stages, in breadth-first order."""
+    producer_of, order = producers(graph), [name]
     for current in order:
-        inputs = (made_by.get(path) for path in graph[current].data)
+        inputs = (producer_of.get(path) for path in graph[current].data)
         order += [stage.name for stage in dict.fromkeys(filter(None, inputs)) if stage.name not in order]
     return order
 
 
-def _record(root: Path, stage: Stage, params: dict[str, Any], known: dict[str, str | None]) -> dict[str, Any]:
+def _record(root: Path, stage: Stage, params: dict[str, Any], digest_cache: dict[str, str | None]) -> dict[str, Any]:
     def digests(paths: tuple[str, ...]) -> dict[str, str | None]:
         for path in paths:
-            if path not in known:
-                known[path] = path_digest(root / path)
-        return {path: known[path] for path in sorted(paths)}
+            if path not in digest_cache:
+                digest_cache[path] = path_digest(root / path)
+        return {path: digest_cache[path] for path in sorted(paths)}
 
     return {
         "params": {key: look_up(params, key) for key in sorted(stage.params)},
@@ -77,12 +81,12 @@ def _record(root: Path, stage: Stage, params: dict[str, Any], known: dict[str, s
 
 
 def library_versions() -> dict[str, str]:
-    """Versions of the libraries whose results end up in a checkpoint."""
+    """Versions of the libraries that affect the bytes of a checkpoint."""
     return {name: version(name) for name in LIBRARIES}
 
 
 def read_provenance(path: Path) -> dict[str, Any]:
-    """The provenance a checkpoint carries. Raises BadInput when there is none of a schema known here."""
+    """The provenance in the header of a checkpoint. Raises BadInput if it is missing or has another schema."""
     if not path.is_file():
         raise BadInput(path, "a checkpoint", "no file", "make it with `dvc repro`")
     metadata = read_metadata(path)

@@ -1,4 +1,4 @@
-"""The raw files and source frames behind a checkpoint or store, with digests and licence; read without torch."""
+"""The raw files and source frames of a checkpoint or store, with digests and licence. Does not import torch."""
 
 import json
 from dataclasses import dataclass
@@ -8,34 +8,34 @@ from typing import Any
 from hoidata.errors import BadInput
 from hoidata.files.written import REMEDY, check_written, read_json
 
-TABLE = "meta/sequences.parquet"
+SEQUENCES = "meta/sequences.parquet"
 
 
 @dataclass(frozen=True)
 class RawClip:
-    """One clip: which frames of which raw files. frames: first and last number in the source, both included."""
+    """The raw files and frames of one clip."""
 
     clip_id: str
     subject: str
     objects: tuple[str, ...]
-    frames: tuple[int, int]
+    frames: tuple[int, int]  # first and last frame in the source, inclusive
     files: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class RawSource:
-    """What of one store was seen. digests: SHA-256 of each raw file by its path below the raw root."""
+    """The raw files and clips of one store that a record uses."""
 
     store: str
     licence: str
     may_be_shared: bool
     where_to_register: str
     synthetic: bool
-    digests: dict[str, str]
+    digests: dict[str, str]  # SHA-256 of each raw file by its path relative to the raw folder
     clips: tuple[RawClip, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """A row per clip; files are numbers of ``files``, as the same few stand behind many clips."""
+        """A list per clip, in which files are indices into ``files``: many clips share the same files."""
         files = list(self.digests)
         number = {path: index for index, path in enumerate(files)}
         rows = [
@@ -50,27 +50,27 @@ _FACTS = ("licence", "may_be_shared", "where_to_register", "synthetic")
 
 
 def raw_from_json(store: str, values: dict[str, Any]) -> RawSource:
-    """What ``RawSource.as_json`` gave."""
+    """The inverse of ``RawSource.as_json``."""
     files = [path for path, _ in values["files"]]
     clips = (
-        RawClip(clip_id, subject, tuple(objects), (first, last), tuple(files[index] for index in numbers))
+        RawClip(clip_id, subject, tuple(objects), frames=(first, last), files=tuple(files[index] for index in numbers))
         for clip_id, subject, objects, first, last, numbers in values["clips"]
     )
     facts = (values[name] for name in _FACTS)
     return RawSource(store, *facts, digests=dict(values["files"]), clips=tuple(clips))
 
 
-def read_raw(root: Path, store: str, wanted: set[str] | None = None) -> RawSource | None:
-    """What lies behind some clips (all when None) of a store; None where the folder holds no clips."""
+def read_raw(root: Path, store: str, clip_ids: set[str] | None = None) -> RawSource | None:
+    """The raw files of some clips (None: all clips) of a store; None if the folder is not a store."""
     folder = root / store
-    if not (folder / TABLE).is_file():
+    if not (folder / SEQUENCES).is_file():
         return None
     info = read_json(folder / "meta/info.json")
     files = _rows(folder / "meta/files.parquet", ["path", "sha256"])
     frames = ["first_source_frame", "last_source_frame"]
     columns = ["clip_id", "subject", "object", "other_objects", *frames, "source_files"]
-    rows = _rows(folder / TABLE, columns)
-    clips = [_clip(row, files) for row in rows if wanted is None or row["clip_id"] in wanted]
+    rows = _rows(folder / SEQUENCES, columns)
+    clips = [_clip(values, files) for values in rows if clip_ids is None or values["clip_id"] in clip_ids]
     used = {path for clip in clips for path in clip.files}
     digests = {file["path"]: file["sha256"] for file in files if file["path"] in used}
     facts = (info.get(name, default) for name, default in zip(_FACTS, ("", False, "", False), strict=True))
@@ -78,7 +78,7 @@ def read_raw(root: Path, store: str, wanted: set[str] | None = None) -> RawSourc
 
 
 def _rows(path: Path, columns: list[str]) -> list[dict[str, Any]]:
-    """Rows of a table, without pandas, whose import takes longer than all the rest."""
+    """Rows of a table, read without pandas, whose import takes longer than the rest of the command."""
     import pyarrow.parquet as parquet
 
     try:
@@ -88,30 +88,31 @@ def _rows(path: Path, columns: list[str]) -> list[dict[str, Any]]:
         raise BadInput(path, "a table of the store", str(error)[:300], REMEDY) from error
 
 
-def _clip(row: dict[str, Any], files: list[dict[str, Any]]) -> RawClip:
-    frames = (row["first_source_frame"], row["last_source_frame"])
-    paths = tuple(files[index]["path"] for index in row["source_files"])
-    return RawClip(row["clip_id"], row["subject"], (row["object"], *row["other_objects"]), frames, paths)
+def _clip(values: dict[str, Any], files: list[dict[str, Any]]) -> RawClip:
+    frames = (values["first_source_frame"], values["last_source_frame"])
+    paths = tuple(files[index]["path"] for index in values["source_files"])
+    objects = (values["object"], *values["other_objects"])
+    return RawClip(values["clip_id"], values["subject"], objects, frames=frames, files=paths)
 
 
 def raw_sources(root: Path | None, record: dict[str, Any]) -> list[RawSource]:
-    """The raw files behind a record: as the checkpoint's header has them, else as the stores here do."""
+    """The raw files of a record: from the checkpoint's header, else from the stores of this project."""
     if "raw" in record:
         return [raw_from_json(store, values) for store, values in record["raw"].items()]
     if root is None:
         return []
-    wanted = clips_of(record) if "clips" in record else None
-    sources = (read_raw(root, path, wanted) for path in stores_behind(record))
+    clip_ids = clips_of(record) if "clips" in record else None
+    sources = (read_raw(root, path, clip_ids) for path in upstream_stores(record))
     return [source for source in sources if source is not None]
 
 
 def clips_of(record: dict[str, Any]) -> set[str]:
-    """The clips a checkpoint learned from or was chosen by."""
+    """The training and validation clips of a checkpoint."""
     return {clip for ids in record.get("clips", {}).values() for clip in ids}
 
 
-def stores_behind(record: dict[str, Any]) -> list[str]:
-    """The inputs and outputs of all stages of a record that may be stores of recorded clips."""
+def upstream_stores(record: dict[str, Any]) -> list[str]:
+    """The inputs and outputs below ``data/`` of all stages of a record; the stores of recorded clips are among them."""
     paths = (
         path
         for stage in record.get("stages", {}).values()
@@ -123,17 +124,17 @@ def stores_behind(record: dict[str, Any]) -> list[str]:
 
 @dataclass(frozen=True)
 class RawList:
-    """The file-level manifest of raw files, of which only this is asked here. files: path, bytes, SHA-256."""
+    """The fields of a file-level manifest that this package reads without importing adapters."""
 
     dataset: str
     synthetic: bool
     licence: str
     where_to_register: str
-    files: tuple[tuple[str, int, str], ...]
+    files: tuple[tuple[str, int, str], ...]  # path, bytes, SHA-256
 
 
 def raw_list(root: Path, path: str) -> RawList | None:
-    """The manifest at ``data/<profile>/<dataset>/raw.json``; None for other paths, or where it is not readable."""
+    """The manifest at ``data/<profile>/<dataset>/raw.json``; None for other paths and unreadable files."""
     if not path.endswith("/raw.json"):
         return None
     try:

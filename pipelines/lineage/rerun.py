@@ -1,4 +1,4 @@
-"""Train a checkpoint again in a clean clone, and compare its tensors."""
+"""`hoidata lineage rerun`: train a checkpoint again in a clean clone, and compare the weights."""
 
 import os
 import subprocess
@@ -16,17 +16,20 @@ from pipelines.lineage.targets import WEIGHTS, Target
 
 
 def rerun(root: Path, target: Target, commit: str = "HEAD") -> tuple[str, str]:
-    """The payload digest of a checkpoint, and that of the same stage run again with the code of a commit.
+    """The digest of a checkpoint's weights, and that of the same stage run again with the code of a commit.
 
-    The clone gets the inputs as they lie here, and the settings of the commit under the profile chosen here. Raises
-    BadInput for what is no checkpoint of this project, HoidataError where the stage fails.
+    The clone gets this project's inputs and profile, and the settings of the commit.
+
+    Raises:
+        BadInput: the target is not a checkpoint of this project.
+        HoidataError: the stage fails.
     """
     stage = target.record.get("stage", "")
     out = Path(target.name).parent
-    words = _arguments(root, out.as_posix(), stage)
-    if target.kind != "checkpoint" or not words:
+    arguments = _arguments(root, out.as_posix(), stage)
+    if target.kind != "checkpoint" or not arguments:
         raise BadInput(
-            target.name, "a checkpoint made by a stage of this project", target.kind, "name one below checkpoints/"
+            target.name, "a checkpoint of a stage of this project", target.kind, "name one below checkpoints/"
         )
     with TemporaryDirectory(prefix="hoidata-rerun-") as folder:
         clone = Path(folder) / "clone"
@@ -34,18 +37,18 @@ def rerun(root: Path, target: Target, commit: str = "HEAD") -> tuple[str, str]:
         _run(clone, "git", "checkout", "--quiet", _resolved(root, commit))
         _link_inputs(root, clone, out)
         _run(clone, *stage_command(clone), "code")
-        _run(clone, *stage_command(clone), *words)
+        _run(clone, *stage_command(clone), *arguments)
         return payload_digest(root / target.name), payload_digest(clone / out / WEIGHTS)
 
 
 def stage_command(project: Path) -> tuple[str, ...]:
-    """What runs a stage in a project: its own code in a clone, else that of the installed hoidata."""
-    words = ["pipelines.stages"] if (project / "pipelines").is_dir() else ["hoidata", "stage"]
-    return (sys.executable, "-m", *words)
+    """The command that runs a stage: the code of the project folder if it is a clone, else the installed hoidata."""
+    module = ["pipelines.stages"] if (project / "pipelines").is_dir() else ["hoidata", "stage"]
+    return (sys.executable, "-m", *module)
 
 
 def _arguments(root: Path, out: str, stage: str) -> list[str]:
-    """What ``pipelines.stages`` is called with for the checkpoint in ``out``, by its place in the project."""
+    """The arguments of ``pipelines.stages`` that write the checkpoint in ``out``; empty if no stage does."""
     parts = Path(out).parts
     if len(parts) != 4 or parts[0] != "checkpoints" or stage not in read_locks(root):
         return []
@@ -53,16 +56,16 @@ def _arguments(root: Path, out: str, stage: str) -> list[str]:
 
 
 def _resolved(root: Path, commit: str) -> str:
-    done = subprocess.run(
+    result = subprocess.run(
         ["git", "rev-parse", "--verify", f"{commit}^{{commit}}"], cwd=root, capture_output=True, text=True
     )
-    if done.returncode:
+    if result.returncode:
         raise BadInput(commit, "a commit of this project", "none", "name one that `git log` shows")
-    return done.stdout.strip()
+    return result.stdout.strip()
 
 
 def _link_inputs(root: Path, clone: Path, out: Path) -> None:
-    """Data, manifests and hoidata.toml where git has none, the other checkpoints and the chosen profile."""
+    """Link data, manifests, hoidata.toml and the other checkpoints into the clone, and set its profile."""
     from pipelines.params import read_params
 
     _, profile, dataset, _ = out.parts
@@ -79,8 +82,10 @@ def _link_inputs(root: Path, clone: Path, out: Path) -> None:
 
 def _run(folder: Path, *command: str) -> None:
     environment = {**os.environ, "PYTHONPATH": str(folder.resolve())}
-    end = partial(end_with_parent, os.getpid())
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment, preexec_fn=end)
-    if done.returncode:
-        lines = (done.stderr or done.stdout).strip().splitlines()
-        raise HoidataError(f"{' '.join(command)}: exit code {done.returncode}: {lines[-1] if lines else ''}")
+    end_with_caller = partial(end_with_parent, os.getpid())
+    result = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, env=environment, preexec_fn=end_with_caller
+    )
+    if result.returncode:
+        lines = (result.stderr or result.stdout).strip().splitlines()
+        raise HoidataError(f"{' '.join(command)}: exit code {result.returncode}: {lines[-1] if lines else ''}")

@@ -1,7 +1,7 @@
-"""What ``hoidata lineage`` is asked about, by path or digest, with the record of how it was made.
+"""The file that a lineage command is about, given by path or digest, and the record of its inputs.
 
-A checkpoint carries its record; a store, table or metric file has that of dvc.lock, where digests are MD5 instead of
-SHA-256; a generated motion names its checkpoints.
+The record of a checkpoint is in its header. That of a store, table or metric file is in dvc.lock, with MD5 instead of
+SHA-256. A generated motion names its checkpoints.
 """
 
 import json
@@ -29,40 +29,44 @@ _DIGEST = re.compile(r"[0-9a-f]{8,64}(\.dir)?")
 
 @dataclass(frozen=True)
 class Target:
-    """name: the path as shown. status and note: of its own bytes, whatever it was made from.
-
-    record: as ``build_provenance`` gives it; of a motion instead the SHA-256 of each checkpoint by path.
-    """
+    """A file, and the record of its inputs."""
 
     kind: Kind
-    name: str
-    record: dict[str, Any]
-    status: str = "same"
+    name: str  # its path, for display
+    record: dict[str, Any]  # as from ``build_provenance``; for a motion, the SHA-256 of each checkpoint by path
+    status: str = "same"  # of the file itself, not of its inputs
     note: str = ""
 
     @property
     def is_of_lock(self) -> bool:
-        """Whether the record's digests are DVC's."""
+        """Whether the record is from dvc.lock, so that its digests are DVC's MD5."""
         return self.record.get("schema") == SCHEMA_LOCK
 
 
-def find_target(root: Path | None, words: str, here: Path | None = None) -> Target:
-    """What a path (relative to ``here``) or a digest means. root: the project, None outside of any.
+def find_target(root: Path | None, path_or_digest: str, here: Path | None = None) -> Target:
+    """The file with a path (relative to ``here``) or a digest.
 
-    Raises BadInput where nothing is found, or no record of how it was made.
+    Args:
+        root: the project folder; None outside of a project.
+        path_or_digest: a path, or the first eight or more characters of a digest.
+        here: the folder that paths are relative to; None for the current folder.
+
+    Raises:
+        BadInput: there is no such file, or no record of its inputs.
     """
-    path = (here or Path()) / words
+    path = (here or Path()) / path_or_digest
     if path.exists():
         return _target_at(root, path)
-    if root is not None and _DIGEST.fullmatch(words):
-        return _target_of_digest(root, words)
-    raise BadInput(words, "a checkpoint, store, metric file or motion, or a digest of one", "no file", "correct it")
+    if root is not None and _DIGEST.fullmatch(path_or_digest):
+        return _target_of_digest(root, path_or_digest)
+    expected = "a checkpoint, store, metric file or motion, or a digest of one"
+    raise BadInput(path_or_digest, expected, "no file", "correct it")
 
 
 def _target_at(root: Path | None, path: Path) -> Target:
     for name in (WEIGHTS, "motion.npz"):
         path = path / name if (path / name).is_file() else path
-    # Links are not followed: DVC may keep what lies in the project elsewhere.
+    # Links are not followed: files of the project may be links into DVC's cache.
     base, whole = (Path(os.path.abspath(root)) if root else None), Path(os.path.abspath(path))
     inside = base is not None and whole.is_relative_to(base)
     name = whole.relative_to(base).as_posix() if base is not None and inside else path.as_posix()
@@ -76,7 +80,7 @@ def _target_at(root: Path | None, path: Path) -> Target:
 
 
 def motion_checkpoints(path: Path) -> dict[str, str]:
-    """The SHA-256 of each checkpoint a generated motion names; empty for any other file."""
+    """The SHA-256 of each checkpoint that a generated motion names; empty for any other file."""
     if path.suffix != ".npz" or not path.is_file():
         return {}
     try:
@@ -90,41 +94,44 @@ def _checkpoint(root: Path | None, path: Path, name: str) -> Target:
     try:
         record, fault = read_provenance(path), seal_fault(path)
     except BadInput:
-        # What DVC wrote as a checkpoint and is none any more.
-        if root is None or (made := _maker(read_locks(root), name)) is None:
+        # A file that a stage wrote as a checkpoint, and that is now damaged.
+        if root is None or (stage := _producer(read_locks(root), name)) is None:
             raise
-        return Target("checkpoint", name, lock_record(root, read_locks(root), made), "tampered", "no readable header")
+        record = lock_record(root, read_locks(root), stage)
+        return Target("checkpoint", name, record, status="tampered", note="no readable header")
     target = Target("checkpoint", name, record)
     if fault:
-        return replace(target, status="tampered", note=f"the {fault} are not what was written")
+        return replace(target, status="tampered", note=f"the {fault} differ from their checksum")
     if root is None:
         return target
-    found = _where_recorded(root, path, record["stage"])
-    if found is None:
+    recorded_in = _recorded_in(root, path, record["stage"])
+    if recorded_in is None:
         return target
     return replace(
-        target, status="same" if found else "orphan", note=found or "no dvc.lock here, now or before, knows it"
+        target,
+        status="same" if recorded_in else "orphan",
+        note=recorded_in or "not in dvc.lock, neither the present nor a committed one",
     )
 
 
-def _where_recorded(root: Path, path: Path, stage: str) -> str | None:
-    """Where DVC noted these bytes as made by ``stage``, in words; "" for nowhere, None where it noted nothing."""
+def _recorded_in(root: Path, path: Path, stage: str) -> str | None:
+    """The lock file with these bytes as output of ``stage``, in words; "" if none has, None without lock files."""
     if not lock_files(root):
         return None
     locks, history = read_locks(root, stage), History(root)
     digests = {dvc_digest(path), dvc_digest(path.parent) if len(list(path.parent.iterdir())) <= 4 else ""}
 
-    def knows(of: dict[str, Locked]) -> bool:
-        outs = of[stage].outs.values() if stage in of else ()
+    def records_output(locks_of_file: dict[str, Locked]) -> bool:
+        outs = locks_of_file[stage].outs.values() if stage in locks_of_file else ()
         return any({out, *cached_listing(root, out).values()} & digests for out in outs)
 
-    if knows(locks):
+    if records_output(locks):
         return "in dvc.lock"
-    seen = set()
+    searched = set()
     for commit, file, content in history.versions(_possible_locks(root)):
-        if content not in seen and knows(parse_locks({file: content})):
+        if content not in searched and records_output(parse_locks({file: content})):
             return f"in {file} of commit {commit[:10]}"
-        seen.add(content)
+        searched.add(content)
     return ""
 
 
@@ -133,29 +140,34 @@ def _possible_locks(root: Path) -> list[str]:
     return list(dict.fromkeys(["dvc.lock", *families, *lock_files(root)]))
 
 
-def _maker(locks: dict[str, Locked], path: str) -> str | None:
-    """The stage that made a path, or a folder it lies in."""
-    made = {out: stage.name for stage in locks.values() for out in stage.outs}
-    return next((made[name] for name in (path, *map(str, Path(path).parents)) if name in made), None)
+def _producer(locks: dict[str, Locked], path: str) -> str | None:
+    """The stage that wrote a path or one of its parent folders."""
+    producers = {out: stage.name for stage in locks.values() for out in stage.outs}
+    return next((producers[name] for name in (path, *map(str, Path(path).parents)) if name in producers), None)
 
 
 def _output(root: Path, name: str) -> Target:
     locks = read_locks(root)
-    maker = _maker(locks, name)
-    if maker is None:
-        remedy = "name a checkpoint, a generated motion, or what a stage of dvc.yaml made"
-        raise BadInput(name, "something with a record of how it was made", "none in dvc.lock", remedy)
-    out = next(out for out in locks[maker].outs if Path(name).is_relative_to(out))
-    same = dvc_digest(root / out) == locks[maker].outs[out]
-    note = "in dvc.lock" if same else "not what the stage wrote, by dvc.lock"
-    return Target("data", name, lock_record(root, locks, maker), "same" if same else "tampered", note)
+    producer = _producer(locks, name)
+    if producer is None:
+        remedy = "name a checkpoint, a generated motion, or an output of a stage of dvc.yaml"
+        raise BadInput(name, "a file with a record of its inputs", "none in dvc.lock", remedy)
+    out = next(out for out in locks[producer].outs if Path(name).is_relative_to(out))
+    same = dvc_digest(root / out) == locks[producer].outs[out]
+    note = "in dvc.lock" if same else "differs from dvc.lock"
+    record = lock_record(root, locks, producer)
+    return Target("data", name, record, status="same" if same else "tampered", note=note)
 
 
 def lock_record(root: Path, locks: dict[str, Locked], stage: str) -> dict[str, Any]:
-    """What dvc.lock notes of a stage and of all behind it, in the form of a checkpoint's provenance."""
-    made, order = {out: lock.name for lock in locks.values() for out in lock.outs}, [stage]
+    """The entries of a stage and all upstream stages in dvc.lock, in the form of a checkpoint's provenance."""
+    producers, order = {out: lock.name for lock in locks.values() for out in lock.outs}, [stage]
     for name in order:
-        order += [made[path] for path in locks[name].deps if path in made and made[path] not in (*order, "code")]
+        order += [
+            producers[path]
+            for path in locks[name].deps
+            if path in producers and producers[path] not in (*order, "code")
+        ]
     stages = {name: _lock_stage(root, locks[name]) for name in dict.fromkeys(order)}
     return {"schema": SCHEMA_LOCK, "stage": stage, "stages": stages}
 
@@ -164,44 +176,52 @@ def _lock_stage(root: Path, lock: Locked) -> dict[str, Any]:
     code = {path: digest for path, digest in lock.deps.items() if path.startswith("code/")}
     files: dict[str, str] = {}
     for path, digest in code.items():
-        known = dvc_digest(root / path) == digest
-        files |= read_json(root / path) if known else {path: digest}
+        is_current = dvc_digest(root / path) == digest
+        files |= read_json(root / path) if is_current else {path: digest}
     inputs = {path: digest for path, digest in lock.deps.items() if path not in code}
     return {"params": lock.params, "code": files, "inputs": inputs, "outputs": lock.outs}
 
 
 def _target_of_digest(root: Path, digest: str) -> Target:
-    """What has a digest: of a checkpoint's tensors or file (SHA-256), of any output as DVC has it (MD5), ever."""
+    """File with a digest: SHA-256 of a checkpoint or its weights, or MD5 of an output in dvc.lock or its history."""
     for path in sorted(root.glob("checkpoints/**/*.safetensors")):
-        if any(found.startswith(digest) for found in (payload_digest(path), sha256_file(path), dvc_digest(path) or "")):
+        if any(
+            candidate.startswith(digest)
+            for candidate in (payload_digest(path), sha256_file(path), dvc_digest(path) or "")
+        ):
             return _target_at(root, path)
     locks = read_locks(root)
     for lock in locks.values():
         if path := _out_with(root, lock, digest):
-            return _target_at(root, root / path) if (root / path).exists() else _gone(root, locks, lock.name, path)
+            return (
+                _target_at(root, root / path)
+                if (root / path).exists()
+                else _missing_target(root, locks, lock.name, path)
+            )
     history = History(root)
     files = _possible_locks(root)
     if commit := history.commit_with(digest, files):
         texts = {file: text for file in files if (text := history.text(commit, file))}
-        then = parse_locks(texts)
-        for lock in then.values():
+        locks_then = parse_locks(texts)
+        for lock in locks_then.values():
             if path := _out_with(root, lock, digest):
-                note = f"made as of commit {commit[:10]}; other bytes lie there now"
-                return replace(_gone(root, then, lock.name, path), note=note)
-    raise BadInput(digest, "the digest of something made here", "no such digest in dvc.lock or git", "name its path")
+                note = f"recorded in commit {commit[:10]}; the file has changed since"
+                return replace(_missing_target(root, locks_then, lock.name, path), note=note)
+    raise BadInput(digest, "the digest of an output of this project", "none in dvc.lock or git", "name its path")
 
 
 def _out_with(root: Path, lock: Locked, digest: str) -> str | None:
-    """The output, or the file in one, that has a digest."""
+    """The output, or the file in an output, with a digest."""
     for path, md5 in lock.outs.items():
         if md5.startswith(digest):
             return path
-        inside = (f"{path}/{name}" for name, found in cached_listing(root, md5).items() if found.startswith(digest))
-        if found := next(inside, None):
-            return found
+        for name, file_md5 in cached_listing(root, md5).items():
+            if file_md5.startswith(digest):
+                return f"{path}/{name}"
     return None
 
 
-def _gone(root: Path, locks: dict[str, Locked], stage: str, path: str) -> Target:
+def _missing_target(root: Path, locks: dict[str, Locked], stage: str, path: str) -> Target:
     kind: Kind = "checkpoint" if path.startswith("checkpoints/") else "data"
-    return Target(kind, path, lock_record(root, locks, stage), "missing", "noted in dvc.lock, no longer here")
+    record = lock_record(root, locks, stage)
+    return Target(kind, path, record, status="missing", note="in dvc.lock, but not here")

@@ -1,1 +1,1 @@
-"""One short function per DVC stage, one file per stage: each file is exactly the code dvc.yaml names for it."""
+"""The DVC stages, one module with a function ``run`` per stage."""

@@ -1,4 +1,4 @@
-"""``python -m pipelines.stages STAGE --profile P [--dataset D] [--model M] [--family F]``: what dvc.yaml runs."""
+"""``python -m pipelines.stages STAGE --profile P [--dataset D] [--model M] [--family F]``: run one stage."""
 
 import argparse
 import importlib
@@ -31,9 +31,9 @@ STAGES = (
 
 
 def main() -> int:
-    """Run one stage in the current folder; the exit code is 0, or 1 with one line that says what to do.
+    """Run one stage in the current folder. Returns the exit code, 0 or 1; an error is one line with a remedy.
 
-    A stage that DVC started ends with it, however DVC ends.
+    A stage that DVC started is killed when DVC ends.
     """
     if "DVC_STAGE" in os.environ:
         _end_with_dvc()
@@ -42,7 +42,9 @@ def main() -> int:
             stream.reconfigure(errors="backslashreplace")  # a file name need not be UTF-8
     parser = argparse.ArgumentParser(prog="python -m pipelines.stages")
     parser.add_argument("stage", choices=STAGES)
-    parser.add_argument("--profile", default="", help="the one params.yaml chooses; no other has its settings there")
+    parser.add_argument(
+        "--profile", default="", help="must be the profile that params.yaml chooses, whose settings are used"
+    )
     parser.add_argument("--dataset", default="")
     parser.add_argument("--model", default="")
     parser.add_argument("--family", default="")
@@ -59,7 +61,7 @@ def main() -> int:
 
 
 def _end_with_dvc() -> None:
-    """DVC started this process, or a shell that has this stage as its only command and that DVC started."""
+    """End with DVC, which started either this process or the shell that runs this stage as its only command."""
     parent = psutil.Process(os.getppid())
     end_with_process(parent.pid)
     if " ".join(sys.argv[1:]) in " ".join(parent.cmdline()[-1:]):
@@ -78,7 +80,7 @@ def _run(module, options: argparse.Namespace) -> int:
         params = read_params(Path())
         chosen = params["profile"]
         if paths.profile not in ("", chosen):
-            raise BadInput("--profile", f"{chosen}, which params.yaml chooses", paths.profile, "choose it there")
+            raise BadInput("--profile", f"{chosen}, which params.yaml chooses", paths.profile, "set it in params.yaml")
         choose_workers(os.environ.get("HOIDATA_WORKERS") or str(params.get("workers", "local")))
         with told_in_words(), noted_run(f"{options.stage}@{paths}"):
             module.run(replace(paths, profile=chosen))

@@ -1,7 +1,7 @@
-"""The adapter of a dataset with the settings of params.yaml: what scanning, checking and converting share.
+"""Adapters with the settings of params.yaml, and manifests of datasets.
 
-One raw dataset may be converted several times side by side: a word in `datasets` with a hyphen, such as `arctic-whole`,
-is a variant of what stands before it. It has the same adapter and raw files; settings, split and folders are its own.
+A name in `datasets` with a hyphen, such as `arctic-whole`, is a variant of the dataset before the hyphen. A variant
+uses the adapter and raw files of that dataset, with separate settings, split and folders.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,62 +14,62 @@ from hoidata.datasets.registry import adapter_names, get_adapter
 from hoidata.errors import BadInput
 from hoidata.machine_folder import machine_folder
 from pipelines.lineage.manifests import ABSENT_HAND, Manifest, absent_manifest, read_manifest, write_manifest
-from pipelines.stages.base import StagePaths, load_settings, own_root, raw_root
+from pipelines.stages.base import StagePaths, load_settings, raw_root, registered_root
 
 
 @dataclass(frozen=True)
 class ConvertSettings:
-    """margin_frames: kept before and after each interaction at 30 fps, None: as each adapter does by itself.
+    """The section ``convert`` of params.yaml."""
 
-    adapters: by dataset, the fields of its adapter's class that are to differ.
-    """
-
-    margin_frames: int | None = None
-    adapters: Mapping[str, Any] = field(default_factory=dict)
+    margin_frames: int | None = None  # frames at 30 fps before and after each interaction; None: the adapter's default
+    adapters: Mapping[str, Any] = field(default_factory=dict)  # by dataset, fields of the adapter's class to set
 
     def __post_init__(self) -> None:
         if self.margin_frames is not None and self.margin_frames < 0:
             raise BadInput("convert.margin_frames", "0 or more frames", f"{self.margin_frames}", "correct it")
 
     def adapter(self, name: str) -> Adapter:
-        """The adapter of that dataset with its settings; its own ``margin_frames`` wins over the common one."""
-        # Without a margin nothing is said of it, so that an adapter without that setting works too.
+        """The adapter of a dataset with its settings; its ``margin_frames`` overrides the common one."""
+        # No margin is passed if none is set, because an adapter may lack that field.
         common = {"margin_frames": self.margin_frames} if self.margin_frames else {}
         return get_adapter(source_of(name), **{**common, **(self.adapters.get(name) or {})})
 
 
 def manifest_of(paths: StagePaths) -> Manifest:
-    """What is known of a dataset's raw files; that it is absent where nothing has been scanned.
+    """The manifest of a dataset; if no files were scanned, a manifest that marks it as absent.
 
-    Of a variant that has no manifest of its own: what is known of its source. An experiment in a temporary copy of the
-    project reads manifests that git does not know yet where they were written.
+    A variant without a manifest has that of its source. An experiment in a temporary copy of the project reads
+    uncommitted manifests from the original project.
     """
-    written = (paths.manifest, source_paths(paths).manifest)
-    known = [folder / path for path in written for folder in (Path(), machine_folder()) if (folder / path).is_file()]
-    return read_manifest(known[0]) if known else absent_manifest(configured_adapter(paths.dataset))
+    candidates = (paths.manifest, source_paths(paths).manifest)
+    existing = [
+        folder / path for path in candidates for folder in (Path(), machine_folder()) if (folder / path).is_file()
+    ]
+    return read_manifest(existing[0]) if existing else absent_manifest(configured_adapter(paths.dataset))
 
 
 def source_of(name: str) -> str:
-    """The dataset that one of params.yaml is a variant of; itself where it has an adapter."""
+    """The dataset that a name in params.yaml is a variant of; the name itself if it has an adapter."""
     return name if "-" not in name or name in adapter_names() else name.partition("-")[0]
 
 
 def source_paths(paths: StagePaths) -> StagePaths:
-    """Where the files of a variant's source lie."""
+    """The paths of a variant's source."""
     return replace(paths, dataset=source_of(paths.dataset))
 
 
 def raw_files(paths: StagePaths) -> Path:
-    """The raw folder of a dataset that is present; of a variant of the user's own data that of its source.
+    """The raw folder of a dataset; for a variant of the user's data, that of its source.
 
-    A generated corpus is written for each variant, as its manifest may hold another recipe. Raises MissingResource.
+    A generated corpus is written for each variant, as its manifest may have another recipe. Raises MissingResource if
+    the folder does not exist.
     """
-    shared = not paths.is_generated and own_root(paths.dataset) is None
+    shared = not paths.is_generated and registered_root(paths.dataset) is None
     return raw_root(source_paths(paths) if shared else paths)
 
 
 def ensure_manifests(profile: str, datasets: Sequence[str]) -> None:
-    """Write the manifests the graph depends on where nobody has: those datasets, and the hand, are absent."""
+    """Write missing manifests of datasets and hand model, which the graph depends on; they mark them as absent."""
     for paths in (StagePaths(profile, name) for name in datasets):
         if not paths.manifest.is_file():
             write_manifest(paths.manifest, manifest_of(paths))
@@ -80,5 +80,5 @@ def ensure_manifests(profile: str, datasets: Sequence[str]) -> None:
 
 
 def configured_adapter(name: str) -> Adapter:
-    """The adapter with the settings of params.yaml. Raises MissingResource for an unknown name, BadInput else."""
+    """The adapter with the settings of params.yaml. Raises MissingResource for an unknown name."""
     return load_settings(ConvertSettings, "convert").adapter(name)

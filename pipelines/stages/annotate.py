@@ -1,10 +1,10 @@
-"""Stage annotate: hand type, sentences and text features of every clip."""
+"""Stage annotate: hand type, sentences and text features of all clips."""
 
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, print_counts, write_empty
 
 
 def run(paths: StagePaths) -> None:
-    """Annotate every clip; a dataset without clips gives an empty output."""
+    """Annotate all clips; a dataset without clips gives an empty output."""
     if reason := empty_reason(paths.clips):
         write_empty(paths.annotation, reason)
         return

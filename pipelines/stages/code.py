@@ -1,8 +1,8 @@
-"""Stage code: for every stage the digests of exactly the code it runs, in ``code/``, which the stage depends on.
+"""Stage code: digests of the code that each stage runs, as files in ``code/`` that the stages depend on.
 
-Always run, so that DVC sees each change: a module that was edited, imported anew, or came with another package.
-What params.yaml sets for one dataset stands there too, so that it concerns that dataset's stages only; and what the
-chosen profile sets otherwise than all profiles do, which DVC does not see in the sections.
+It always runs, so that DVC sees each change: an edited module, a new import, another version of a package. The files
+also have settings of params.yaml that DVC cannot track: those of one dataset, which concern only its stages, and those
+that the chosen profile overrides.
 """
 
 from collections.abc import Collection
@@ -21,97 +21,99 @@ from pipelines.stages.families import families_of
 CODE = Path("code")
 STAGES_OF_DATASETS = ("raw", "convert", "quality", "annotate", "contact", "split")
 DATASETS = "hoidata.datasets"
-# Modules that read files in the folder of a dataset they are given by name, and which.
+# Modules that read files in a dataset's folder, and the patterns of these files.
 READERS = {
     "hoidata.dataset_folders": ("facts.toml",),
     "hoidata.splits.definitions": ("splits/*.json", "published.json"),
 }
 
 
-# Sections of params.yaml that hold a key per dataset. It may be absent, which DVC does not allow of a parameter.
+# Sections of params.yaml with a key per dataset. DVC cannot depend on such a key, because it may be absent.
 SECTIONS_OF_DATASETS = {"convert": ("convert", "adapters"), "split": ("split",)}
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where the code of a stage begins. chosen: by module what it picks by name."""
+    """The module where the code of a stage begins."""
 
     module: str
-    chosen: dict[str, list[Choice]] = field(default_factory=dict)
+    chosen: dict[str, list[Choice]] = field(default_factory=dict)  # run-time choices, by module
 
 
 def run(paths: StagePaths) -> None:
-    """Write one file per stage, and per dataset, network or family where that chooses among modules.
+    """Write one file per stage, or per stage and dataset, network or family if that selects modules.
 
-    Manifests the graph depends on and nobody has written are written too: those datasets are absent.
+    Also writes missing manifests, which the graph depends on; they mark the datasets as absent.
     """
     params = read_params(Path())
     for name in params["datasets"]:
-        families_of(params, name)  # refuses names without stages
+        families_of(params, name)  # raises for names without stages
     runs = [StagePaths(params["profile"], name) for name in params["datasets"]]
     if not all(path.is_file() for paths in runs for path in (paths.manifest, paths.hand_manifest)):
-        from pipelines.stages.adapters import ensure_manifests  # imports adapters, which takes longer than all the rest
+        from pipelines.stages.adapters import ensure_manifests  # imports adapters, which is slow
 
         ensure_manifests(params["profile"], params["datasets"])
     write_code(Path())
 
 
 def write_code(root: Path) -> None:
-    """Write ``code/`` of the project at ``root`` anew."""
+    """Replace ``code/`` of the project at ``root``."""
     with atomic_folder(root / CODE) as partial:
         for path, digests in code_today(root).items():
             write_json(partial / Path(path).relative_to(CODE), digests)
 
 
 def code_today(root: Path, only: Collection[str] | None = None) -> dict[str, dict[str, str]]:
-    """What belongs into each file of ``code/`` as the code is now, by its path (``code/convert/grab.json``).
+    """The content of the files of ``code/`` for the present code, by path (``code/convert/grab.json``).
 
-    only: these files alone.
+    Args:
+        root: the project folder.
+        only: paths of the files to compute; None for all.
     """
     plain = read_file(root / "params.yaml")
     params = chosen_params(plain)
     tree = SourceTree(root, {f"{DATASETS}.{name}": folder for name, folder in outside_folders().items()})
     starts = {f"{CODE / name}.json": (name, start) for name, start in closures(params, tree).items()}
-    found = {
+    contents = {
         path: tree.closure([start.module], start.chosen)
-        | own_settings(params, name)
+        | dataset_settings(params, name)
         | profile_settings(plain, params, name)
         for path, (name, start) in starts.items()
         if only is None or path in only
     }
-    tree.keep_imports()
-    return found
+    tree.save_imports()
+    return contents
 
 
 def closures(params: dict[str, Any], tree: SourceTree) -> dict[str, Start]:
-    """Where the code of each file of ``code/`` begins: the one table of what the stages run."""
-    found, every = {}, {}
+    """The start module and choices for each file of ``code/``, by its path without suffix."""
+    starts, all_choices = {}, {}
     for dataset in params["datasets"]:
         chosen = _chosen_by_dataset(tree, dataset)
-        found |= {f"{stage}/{dataset}": _start(stage, chosen) for stage in STAGES_OF_DATASETS}
-        every = {module: [*every.get(module, ()), *choices] for module, choices in chosen.items()}
+        starts |= {f"{stage}/{dataset}": _start(stage, chosen) for stage in STAGES_OF_DATASETS}
+        all_choices = {module: [*all_choices.get(module, ()), *choices] for module, choices in chosen.items()}
     sizes = [section for section in params["train"].values() if isinstance(section, dict)]
     for network in dict.fromkeys([*NETWORKS, *(name for section in sizes for name in section)]):
-        found[f"train/{network}"] = _start("train", every | _families(network_modules(network)))
+        starts[f"train/{network}"] = _start("train", all_choices | _families(network_modules(network)))
     for family in dict.fromkeys([*family_names(), *params["families"]]):
-        found[f"sample/{family}"] = _start("sample", every | _families([family_module(family)]))
-    rows = (params.get("controls") or {}).get("families") or []
-    found["controls"] = _start("controls", every | _families([family_module(family) for family in rows]))
-    every |= _families([family_module(family) for family in params["families"]])
-    return found | {stage: _start(stage, every) for stage in ("evaluator", "evaluate", "report")}
+        starts[f"sample/{family}"] = _start("sample", all_choices | _families([family_module(family)]))
+    controls = (params.get("controls") or {}).get("families") or []
+    starts["controls"] = _start("controls", all_choices | _families([family_module(family) for family in controls]))
+    all_choices |= _families([family_module(family) for family in params["families"]])
+    return starts | {stage: _start(stage, all_choices) for stage in ("evaluator", "evaluate", "report")}
 
 
 def _families(modules: list[str]) -> dict[str, list[Choice]]:
-    """Of the table of all families only what is picked here counts: one more row concerns no other family."""
-    return {"models.registry": [Choice(tuple(modules), is_table=True)]}
+    """The choice of ``models.registry``: a new family does not change the digests of the others."""
+    return {"models.registry": [Choice(tuple(modules), is_registry=True)]}
 
 
 def _start(stage: str, chosen: dict[str, list[Choice]]) -> Start:
     return Start(f"pipelines.stages.{stage}", chosen)
 
 
-def own_settings(params: dict[str, Any], name: str) -> dict[str, str]:
-    """What params.yaml sets for the one dataset of a file of ``code/``, as JSON; nothing and ``{}`` are the same."""
+def dataset_settings(params: dict[str, Any], name: str) -> dict[str, str]:
+    """The settings of the dataset of a file of ``code/``, as JSON; ``{}`` equals an absent key."""
     stage, _, dataset = name.partition("/")
     if stage not in SECTIONS_OF_DATASETS:
         return {}
@@ -122,37 +124,45 @@ def own_settings(params: dict[str, Any], name: str) -> dict[str, str]:
 
 
 def profile_settings(plain: dict[str, Any], params: dict[str, Any], name: str) -> dict[str, str]:
-    """What the stages of a file of ``code/`` read, as JSON, where the chosen profile has it otherwise.
+    """The settings of a file's stages, as JSON, if the chosen profile overrides them; else empty.
 
-    plain: params.yaml without the overlay; params: with it.
+    Args:
+        plain: params.yaml without the profile's overlay.
+        params: params.yaml with the overlay.
+        name: the file of ``code/``, without suffix.
     """
-    found = _settings_read(params, name)
-    if found == _settings_read(plain, name):
+    settings = _settings_read(params, name)
+    if settings == _settings_read(plain, name):
         return {}
-    return {f"params.yaml profiles.{params['profile']}.{name.partition('/')[0]}": canonical_json(found)}
+    return {f"params.yaml profiles.{params['profile']}.{name.partition('/')[0]}": canonical_json(settings)}
 
 
 def _settings_read(params: dict[str, Any], name: str) -> Any:
-    """The sections a stage reads, but for what it reads of a section of datasets."""
-    stage, _, of = name.partition("/")
+    """The sections that a stage reads, without the settings per dataset."""
+    stage, _, name_in_stage = name.partition("/")
     section = params.get(stage) or {}
     if stage == "train":
-        return section.get("seed"), *_trained(section, of)
+        return section.get("seed"), *_network_settings(section, name_in_stage)
     if stage in SECTIONS_OF_DATASETS:
         return section.get("margin_frames")
     return (section, params.get("sample")) if stage == "controls" else section
 
 
-def _trained(section: dict[str, Any], network: str) -> list[Any]:
-    """A network's settings by preset and by size."""
+def _network_settings(section: dict[str, Any], network: str) -> list[Any]:
+    """The settings of a network in the chosen preset and size."""
     return [(section.get(str(section.get(kind))) or {}).get(network) for kind in ("preset", "size")]
 
 
 def _chosen_by_dataset(tree: SourceTree, name: str) -> dict[str, list[Choice]]:
-    """The dataset's adapter, in its folder or registered by another package, and what is read of its folder."""
-    added = tree.modules_below(f"{DATASETS}.{name}") or tree.added("hoidata.adapters", name)
-    name = name if added else name.partition("-")[0]  # a variant, such as arctic-whole
+    """The choices of one dataset: the modules of its adapter, and the files that are read in its folder."""
+
+    def adapter_modules(dataset: str) -> list[str]:
+        return tree.modules_below(f"{DATASETS}.{dataset}") or tree.entry_point_modules("hoidata.adapters", dataset)
+
+    modules = adapter_modules(name)
+    if not modules:  # a variant, such as arctic-whole
+        name = name.partition("-")[0]
+        modules = adapter_modules(name)
     package = f"{DATASETS}.{name}"
-    modules = added or tree.modules_below(package) or tree.added("hoidata.adapters", name)
-    read = {reader: [Choice(package=package, files=files)] for reader, files in READERS.items()}
-    return {f"{DATASETS}.registry": [Choice(tuple(modules))], **read}
+    readers = {reader: [Choice(package=package, files=files)] for reader, files in READERS.items()}
+    return {f"{DATASETS}.registry": [Choice(tuple(modules))], **readers}

@@ -1,10 +1,10 @@
-"""Stage contact: contact maps and sparse distances on sampled points of every object."""
+"""Stage contact: contact maps and sparse distances on points sampled on the objects."""
 
 from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, load_settings, print_counts, write_empty
 
 
 def run(paths: StagePaths) -> None:
-    """Measure every clip; a dataset without clips gives an empty output."""
+    """Measure all clips; a dataset without clips gives an empty output."""
     if reason := empty_reason(paths.clips):
         write_empty(paths.contact, reason)
         return

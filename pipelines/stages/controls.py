@@ -15,16 +15,16 @@ OFF = "off: params.yaml names no families under controls"
 
 @dataclass(frozen=True)
 class ControlSettings:
-    """families: which rows; none turns the stage off. samples: motions per test clip; None: as in the stage sample."""
+    """The section ``controls`` of params.yaml."""
 
-    families: tuple[str, ...] = ()
-    samples: int | None = None
+    families: tuple[str, ...] = ()  # baselines and negative controls to sample; none turns the stage off
+    samples: int | None = None  # motions per test clip; None: as in the stage sample
 
 
 def run(paths: StagePaths) -> None:
-    """Write motions of every row, as the stage sample would, into the folder ``controls``.
+    """Sample each baseline and control, as the stage sample does, into the folder ``controls``.
 
-    paths.family: the optional family whose rows are meant, in ``controls-<family>``; without, those of no such family.
+    With ``paths.family``, sample only those that use the networks of this optional family, into ``controls-<family>``.
     """
     settings = load_settings(ControlSettings, "controls")
     folder = replace(paths, family="-".join(filter(None, ("controls", paths.family)))).samples
@@ -36,13 +36,13 @@ def run(paths: StagePaths) -> None:
     if settings.samples is not None:
         params = params | {"sample": params["sample"] | {"samples": settings.samples}}
     for path in folder.iterdir() if folder.is_dir() else ():
-        if path.name not in names:  # an earlier run sampled it
+        if path.name not in names:  # sampled by an earlier run with other settings
             shutil.rmtree(path) if path.is_dir() else path.unlink()
     for name in names:
         sample(replace(paths, family=f"{folder.name}/{name}"), params, name)
 
 
 def _optional_family(name: str) -> str:
-    """The optional family whose networks a row uses; empty for all other rows."""
+    """The optional family whose networks a baseline or control uses; empty if none."""
     folder = family_module(name).split(".")[1]
     return folder if folder in OPTIONAL_FAMILIES else ""

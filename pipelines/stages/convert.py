@@ -1,4 +1,4 @@
-"""Stage convert: raw files to a store of clips; sequences that cannot be used are left out with their reason."""
+"""Stage convert: raw files to a store of clips; unusable sequences are quarantined with their reason."""
 
 from hoidata.conversion.convert import convert_dataset
 from pipelines.lineage.manifests import read_manifest
@@ -7,7 +7,7 @@ from pipelines.stages.base import StagePaths, jobs, load_hands, note_empty
 
 
 def run(paths: StagePaths) -> None:
-    """Convert the dataset with its adapter, each raw file checked against the manifest; none present, none read."""
+    """Convert the dataset with its adapter and check all raw files against the manifest."""
     adapter = configured_adapter(paths.dataset)
     manifest = read_manifest(paths.raw_manifest)
     summary = convert_dataset(

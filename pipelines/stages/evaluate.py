@@ -1,4 +1,4 @@
-"""Stage evaluate: every metric of all motions of one dataset, a file per family. It knows no family."""
+"""Stage evaluate: the metrics of all sampled motions of one dataset, one file per family."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -23,52 +23,52 @@ CODE = Path("code/evaluate.json")
 
 @dataclass(frozen=True)
 class EvaluateSettings:
-    """metrics: lists of ``hoidata/metrics/asked_metrics.py`` that are computed beside the one that always is."""
+    """The section ``evaluate`` of params.yaml."""
 
-    metrics: tuple[str, ...] = ()
+    metrics: tuple[str, ...] = ()  # lists of ``hoidata/metrics/asked_metrics.py`` to compute in addition to the default
 
 
 def run(paths: StagePaths) -> None:
     """Write ``<family>.json`` for each family of params.yaml and ``controls/<name>.json`` for each control.
 
-    A dataset or family without motions gets the reason instead. What an earlier run measured is taken over where
-    nothing that it was made from has changed, so that a further family measures that family alone.
+    The file of a dataset or family without motions has the reason instead. Metrics of an earlier run are reused if
+    their inputs have not changed, so that a new family does not measure the others again.
     """
     settings = load_settings(EvaluateSettings, "evaluate")
     families = families_of(read_params(Path()), paths.dataset)
     runs = {name: replace(paths, family=name) for name in families} | dict(_controls(paths))
-    if missing := [str(own.samples) for own in runs.values() if not own.samples.is_dir()]:
+    if missing := [str(family_paths.samples) for family_paths in runs.values() if not family_paths.samples.is_dir()]:
         remedy = "correct params.yaml: families, or add stages that sample it"
         raise BadInput(", ".join(missing), "motions of every family of params.yaml", "no folder", remedy)
     shared = [settings.metrics, *map(path_digest, (CODE, *_inputs(paths), paths.evaluators))]
-    found = {name: _kept_or_measured(own, settings, shared) for name, own in runs.items()}
+    metrics = {name: _cached_or_measured(family_paths, settings, shared) for name, family_paths in runs.items()}
     with atomic_folder(paths.metrics) as partial:
-        for name, values in found.items():
+        for name, values in metrics.items():
             write_json(partial / f"{name}.json", values)
 
 
 def _controls(paths: StagePaths) -> Iterator[tuple[str, StagePaths]]:
-    """The rows of the stages ``controls``, by the name of their metrics."""
+    """The samples of the stages ``controls``, with the names of their metric files."""
     for folder in sorted(replace(paths, family="").samples.glob("controls*")):
-        for row in sorted(folder.iterdir()):
-            if row.is_dir():
-                yield f"controls/{row.name}", replace(paths, family=f"{folder.name}/{row.name}")
+        for method in sorted(folder.iterdir()):
+            if method.is_dir():
+                yield f"controls/{method.name}", replace(paths, family=f"{folder.name}/{method.name}")
 
 
 def _inputs(paths: StagePaths) -> tuple[Path, ...]:
     return paths.clips, paths.annotation, paths.contact, paths.splits
 
 
-def _kept_or_measured(paths: StagePaths, settings: EvaluateSettings, shared: list[Any]) -> dict[str, Any]:
-    """The metrics of one family; of an earlier run, also one that was stopped, where it measured the same."""
-    made_from = value_digest([*shared, path_digest(paths.samples)])
+def _cached_or_measured(paths: StagePaths, settings: EvaluateSettings, shared: list[Any]) -> dict[str, Any]:
+    """The metrics of one family, from the cache of an earlier or interrupted run if the inputs are equal."""
+    digest = value_digest([*shared, path_digest(paths.samples)])
     with suppress(BadInput, FileNotFoundError):
-        kept = read_json(paths.measured)
-        if kept.get("made_from") == made_from:
-            return kept["metrics"]
-    found = _measured(paths, settings)
-    write_whole(paths.measured, canonical_json({"made_from": made_from, "metrics": found}))
-    return found
+        cached = read_json(paths.measured)
+        if cached.get("made_from") == digest:
+            return cached["metrics"]
+    metrics = _measured(paths, settings)
+    write_whole(paths.measured, canonical_json({"made_from": digest, "metrics": metrics}))
+    return metrics
 
 
 def _measured(paths: StagePaths, settings: EvaluateSettings) -> dict[str, Any]:
@@ -78,7 +78,7 @@ def _measured(paths: StagePaths, settings: EvaluateSettings) -> dict[str, Any]:
     from hoidata.metrics.evaluate import evaluate_store
 
     print(f"{paths}: measuring", flush=True)
-    found = evaluate_store(
+    metrics = evaluate_store(
         paths.samples / "clips",
         paths.data,
         load_hands(paths.profile),
@@ -87,19 +87,19 @@ def _measured(paths: StagePaths, settings: EvaluateSettings) -> dict[str, Any]:
         jobs=jobs(),
         progress=True,
     )
-    found["left_out"] = _with_reasons(found["left_out"], paths.samples / "left_out.json")
-    return found | {"diagnostics": read_json(paths.samples / "diagnostics.json")}
+    metrics["left_out"] = _with_reasons(metrics["left_out"], paths.samples / "left_out.json")
+    return metrics | {"diagnostics": read_json(paths.samples / "diagnostics.json")}
 
 
-def _with_reasons(left_out: list[dict[str, str]], told: Path) -> list[dict[str, str]]:
-    """What was left out, with the reason of the family itself where it had no motion for a clip."""
-    known = read_json_rows(told, {"clip_id": str, "reason": str}) if told.is_file() else []
-    reasons = {item["clip_id"].rpartition("~")[0]: item["reason"] for item in known}
+def _with_reasons(left_out: list[dict[str, str]], path: Path) -> list[dict[str, str]]:
+    """The skipped clips, with the family's reason if it gave no motion for a clip."""
+    entries = read_json_rows(path, {"clip_id": str, "reason": str}) if path.is_file() else []
+    reasons = {item["clip_id"].rpartition("~")[0]: item["reason"] for item in entries}
     return [{**item, "reason": reasons.get(item["clip_id"], item["reason"])} for item in left_out]
 
 
 def _encoders(folder: Path) -> list["MotionEvaluator"]:
-    """The networks of the stage evaluator; none, and no torch either, where that is off."""
+    """The networks of the stage evaluator; empty, without importing torch, if that stage is off."""
     if not (folder / "info.json").is_file():
         return []
     from models.evaluator.encoders import load_evaluators

@@ -1,4 +1,4 @@
-"""Stage evaluator: the networks that tell what a motion shows, trained on recorded clips of one dataset."""
+"""Stage evaluator: action classifiers for the metrics, trained on the recorded clips of one dataset."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ OFF = "off: params.yaml names no networks under evaluator"
 
 
 def run(paths: StagePaths) -> None:
-    """Train all of them; a dataset without clips or labels, or none asked for, gives an empty output."""
+    """Train the networks; a dataset without clips or labels, or settings without networks, give an empty output."""
     settings = load_settings(EvaluatorSettings, "evaluator")
     folders = (paths.clips, paths.annotation, paths.contact, paths.splits)
     reason = next(filter(None, map(empty_reason, folders)), None) if settings.networks else OFF
@@ -26,7 +26,7 @@ def run(paths: StagePaths) -> None:
 
     make_repeatable(threads=1)
     stage = producers(written_graph(Path()))[paths.evaluators.as_posix()].name
-    found = train_evaluators(
+    result = train_evaluators(
         paths.data,
         paths.evaluators,
         settings,
@@ -36,8 +36,8 @@ def run(paths: StagePaths) -> None:
         progress=replace(paths, model="evaluator").training,
         code=sha256_file(CODE) if CODE.is_file() else "",
     )
-    if isinstance(found, str):
-        write_empty(paths.evaluators, found)
+    if isinstance(result, str):
+        write_empty(paths.evaluators, result)
         return
-    for name, known in found["evaluators"].items():
-        print(f"{paths}: {name}: {known.get('accuracy') or known['loss']}")
+    for name, facts in result["evaluators"].items():
+        print(f"{paths}: {name}: {facts.get('accuracy') or facts['loss']}")

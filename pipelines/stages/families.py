@@ -1,11 +1,11 @@
-"""Which families have motions of a dataset."""
+"""The families whose motions are sampled and measured for a dataset."""
 
 from typing import Any
 
 from hoidata.errors import BadInput
 from hoidata.settings import refuse_unknown
 
-# By folder of models/: families that have stages only for datasets of ``family_datasets`` in params.yaml.
+# By folder of models/: families with stages only for the datasets of ``family_datasets`` in params.yaml.
 OPTIONAL_FAMILIES = {
     "manipnet": ("manipnet",),
     "bimart": ("bimart", "bimart-unrefined", "nearest-window", "mean-pose-at-object"),
@@ -14,7 +14,7 @@ KEY = "family_datasets"
 
 
 def families_of(params: dict[str, Any], dataset: str) -> list[str]:
-    """The families of params.yaml whose motions of a dataset are measured, in the order of tables.
+    """The families whose motions of a dataset are measured, in the order of tables.
 
     Raises BadInput for names that have no stages.
     """

@@ -1,4 +1,4 @@
-"""Stage raw: the file-level manifest of a dataset, after the files it lists were written or checked."""
+"""Stage raw: write a generated corpus or check the user's raw files, and write their file-level manifest."""
 
 from pathlib import Path
 
@@ -16,34 +16,34 @@ WRITER = "hoidata.synthetic.corpus"
 
 
 def run(paths: StagePaths) -> None:
-    """Write ``raw.json``: the committed manifest itself, or for a generated corpus the files its recipe gives."""
+    """Write ``raw.json``: the committed manifest, or for a generated corpus the manifest of its files."""
     manifest = manifest_of(paths)
     if manifest.present and manifest.synthetic:
         manifest = manifest.with_files(generated_files(paths, manifest))
     elif manifest.present:
         require_hand(paths)
-        check_own_files(paths, manifest)
+        check_user_files(paths, manifest)
     write_manifest(paths.raw_manifest, manifest)
     print(f"{paths}: {len(manifest.files)} raw files" if manifest.present else f"{paths}: not present")
 
 
 def generated_files(paths: StagePaths, manifest: Manifest) -> tuple[SourceFile, ...]:
-    """Write the corpus of the manifest's recipe, unless the same recipe and code already did, and list its files."""
+    """Write the corpus of the manifest's recipe, unless recipe and code are unchanged, and list its files."""
     root = paths.generated_raw
-    stamp, wanted = root.with_suffix(".recipe"), recipe_digest(manifest)
-    if not (root.is_dir() and stamp.is_file() and stamp.read_text() == wanted):
+    stamp, digest = root.with_suffix(".recipe"), recipe_digest(manifest)
+    if not (root.is_dir() and stamp.is_file() and stamp.read_text() == digest):
         write_generated(paths, manifest, root)
-        write_whole(stamp, wanted)
+        write_whole(stamp, digest)
     return scan_files(root, configured_adapter(paths.dataset).parts)
 
 
 def recipe_digest(manifest: Manifest) -> str:
-    """Digest of the recipe and of the code that follows it; what reads the files afterwards does not count."""
+    """Digest of the recipe and of the code that writes the corpus."""
     return value_digest([manifest.recipe, SourceTree(Path()).closure([WRITER], {})])
 
 
 def write_generated(paths: StagePaths, manifest: Manifest, root: Path) -> None:
-    """Write the corpus of the manifest's recipe into ``root``, whole or not at all."""
+    """Write the corpus of the manifest's recipe into ``root``, completely or not at all."""
     from hoidata.synthetic.corpus import write_corpus
 
     recipe = manifest.recipe or {}
@@ -53,20 +53,20 @@ def write_generated(paths: StagePaths, manifest: Manifest, root: Path) -> None:
 
 
 def require_hand(paths: StagePaths) -> None:
-    """Refuse a dataset of MANO parameters without MANO files, saying where to register and what to set."""
+    """Raise MissingResource with a remedy if the dataset needs MANO files that are not registered."""
     adapter = configured_adapter(paths.dataset)
     if not adapter.needs_mano or hand_is_present(paths.profile):
         return
     key, _, value = getattr(adapter, "without_mano", "").partition("=")
     setting = f"; or set `{paths.dataset}: {{{key}: {value}}}` under `convert.adapters` in params.yaml" if key else ""
     raise MissingResource(
-        f"{paths.dataset} holds MANO parameters and no MANO files are registered. Register at "
+        f"{paths.dataset} has MANO parameters and no MANO files are registered. Register at "
         f"https://mano.is.tue.mpg.de, put MANO_RIGHT.pkl and MANO_LEFT.pkl into one folder, then run "
         f"`hoidata raw scan mano --root FOLDER` (it can also be named in {root_variable('hand')}){setting}"
     )
 
 
-def check_own_files(paths: StagePaths, manifest: Manifest) -> None:
+def check_user_files(paths: StagePaths, manifest: Manifest) -> None:
     """Compare the user's files with the scanned manifest. Raises BadInput that lists the first differences."""
     root = raw_files(paths)
     differences = verify_files(root, manifest, configured_adapter(paths.dataset).parts)

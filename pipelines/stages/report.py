@@ -1,4 +1,4 @@
-"""Stage report: one page over all datasets of a profile, with a motion made for a held-out sentence of each."""
+"""Stage report: one page about all datasets of a profile, with a generated motion for a held-out sentence of each."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Stage sample: the motions of families for the test clips of one dataset, each as an ordinary store of clips."""
+"""Stage sample: motions of families for the test clips of one dataset, a store of clips per family."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,15 +13,15 @@ def run(paths: StagePaths) -> None:
     A dataset without clips, or a family that is not trained, gives an empty output.
     """
     for family in paths.family.split(","):
-        own = replace(paths, family=family)
+        family_paths = replace(paths, family=family)
         if reason := empty_reason(paths.clips):
-            write_empty(own.samples, reason)
+            write_empty(family_paths.samples, reason)
         else:
-            sample(own, read_params(Path()), family)
+            sample(family_paths, read_params(Path()), family)
 
 
 def sample(paths: StagePaths, params: dict, family: str) -> None:
-    """Motions of a family into ``paths.samples``; params: all of params.yaml."""
+    """Write the motions of a family into ``paths.samples``, with settings of ``params`` (all of params.yaml)."""
     from models.common.predicting import sample_family
     from models.common.repeatable import chosen_device, make_repeatable
     from models.registry import load_family

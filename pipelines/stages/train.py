@@ -1,4 +1,4 @@
-"""Stage train: one network on one dataset, with the record of what it was made from."""
+"""Stage train: train one network on one dataset, and store its provenance in the checkpoint."""
 
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -18,31 +18,27 @@ from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_set
 
 @dataclass(frozen=True)
 class TrainParams:
-    """preset: which method; size: which sizes and budgets, laid over it. Each has a section per network, whose keys the
-    network checks.
+    """The section ``train`` of params.yaml. The network checks the keys of its preset and size."""
 
-    processes: how many train one network together; ``training.micro_batches`` says what each step computes.
-    """
-
-    preset: Literal["paper", "ours"]
-    size: Literal["small", "full"]
+    preset: Literal["paper", "ours"]  # the method
+    size: Literal["small", "full"]  # layer sizes and training budgets, merged over the preset
     seed: int
     paper: Mapping[str, Any]
     ours: Mapping[str, Any]
     small: Mapping[str, Any]
     full: Mapping[str, Any]
-    processes: int = 1
+    processes: int = 1  # that train one network together; ``training.parts`` sets what each step computes
 
     def of(self, network: str) -> dict[str, Any]:
-        """The network's settings by preset and size, with the seed; a network without any keeps its defaults."""
+        """The settings of a network in the chosen preset and size, and the seed; the others keep their defaults."""
         method, size = (getattr(self, name).get(network) or {} for name in (self.preset, self.size))
         return laid_over(laid_over(method, size), {"seed": self.seed})
 
 
 def run(paths: StagePaths) -> None:
-    """Train ``paths.model``; a dataset without clips, or without what the network builds on, gives an empty output.
+    """Train ``paths.model``; a dataset without clips, or without a network that it needs, gives an empty output.
 
-    A killed training goes on where it was: what it needs for that, and its losses, lie in ``paths.training``.
+    A killed training resumes: its state and losses are in ``paths.training``.
     """
     needed = [paths.checkpoints / name for name in load_network(paths.model).needs]
     if reason := next(filter(None, map(empty_reason, [paths.clips, *needed])), None):
@@ -57,27 +53,27 @@ def run(paths: StagePaths) -> None:
 
 
 def train(paths: StagePaths) -> None:
-    """One process of the training of ``paths.model``."""
+    """Run one of the processes that train ``paths.model``."""
     params = load_settings(TrainParams, "train").of(paths.model)
     code = Path("code", "train", f"{paths.model}.json")
     train_into(paths.checkpoint, paths, params, paths.training, code)
 
 
 def full_key(network: str, key: str, path: Path = Path("params.yaml")) -> str:
-    """The key of params.yaml that decides a setting of a network, such as ``train.small.length.training.steps``.
+    """The full key in params.yaml that sets a setting of a network, such as ``train.small.length.training.steps``.
 
-    The one of the size where nothing is said: what is written there is laid over the preset.
+    The key of the size if the setting is not in the file, since a size overrides the preset.
     """
     values, chosen = read_file(path), load_settings(TrainParams, "train", path)
     profile = ("profiles", str(values.get("profile")))
-    places = [(*at, "train", own, network) for own in (chosen.size, chosen.preset) for at in (profile, ())]
-    for place in places:
-        if _is_said(values, (*place, *key.split("."))):
-            return ".".join((*place, key))
-    return ".".join((*places[1], key))
+    sections = [(*top, "train", name, network) for name in (chosen.size, chosen.preset) for top in (profile, ())]
+    for section in sections:
+        if _is_set(values, (*section, *key.split("."))):
+            return ".".join((*section, key))
+    return ".".join((*sections[1], key))
 
 
-def _is_said(values: Any, names: Sequence[str]) -> bool:
+def _is_set(values: Any, names: Sequence[str]) -> bool:
     for name in names:
         if not isinstance(values, Mapping) or name not in values:
             return False
@@ -85,22 +81,27 @@ def _is_said(values: Any, names: Sequence[str]) -> bool:
     return True
 
 
-def train_into(made: Path, paths: StagePaths, params: Mapping[str, Any], progress: Path, code: Path) -> None:
-    """Train ``paths.model`` by its settings into the output ``made``. progress: of a killed training.
+def train_into(out: Path, paths: StagePaths, params: Mapping[str, Any], progress: Path, code: Path) -> None:
+    """Train ``paths.model`` and write the checkpoint.
 
-    code: the file with the digests of what runs.
+    Args:
+        out: the folder of the checkpoint.
+        paths: of the stage run.
+        params: the settings of the network.
+        progress: the folder with the state of a killed training.
+        code: the file with the digests of the stage's code.
     """
     from models.common.repeatable import chosen_device, make_repeatable
     from models.common.team import Team
     from models.common.training import train_network
 
     network = load_network(paths.model)
-    stage = producers(written_graph(Path()))[made.as_posix()].name
-    make_repeatable(threads=1)  # stages run side by side; more processes train one network together
+    stage = producers(written_graph(Path()))[out.as_posix()].name
+    make_repeatable(threads=1)  # other cores run other stages; ``train.processes`` sets the number for one network
     train_network(
         network,
         paths.data,
-        made,
+        out,
         params,
         load_hands(paths.profile),
         needed={load_network(name): paths.checkpoints / name for name in network.needs},

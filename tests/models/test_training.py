@@ -33,7 +33,8 @@ from models.text2hoi.diffusion import DiffusionModel
 from models.text2hoi.generation import GeneratedMotion, Generator, Wish
 from models.text2hoi.sampler import SamplingConfig, Text2Hoi
 from models.text2hoi.verb_check import VerbCheck
-from pipelines.generation import Asked, Models, generate_files
+from pipelines.generation import GenerationRequest as Asked
+from pipelines.generation import Models, generate_files
 from tests.models.toy import PARAMS, train
 
 
@@ -250,7 +251,7 @@ def test_a_sentence_classified_as_another_verb_is_reported(trained: Path, tmp_pa
     notes = {}
     for text in ("Lift a box with the left hand.", "Juggle a box with both hands."):
         request = Asked(text, tmp_path / "box.stl", models=models, wish=wish, force=True)
-        notes[text] = [note for note in generate_files(request, tmp_path / "out").notes if "taken for '" in note]
+        notes[text] = [note for note in generate_files(request, tmp_path / "out").notes if "classified as '" in note]
     assert [len(own_notes) for own_notes in notes.values()] == [0, 1]
     page = (tmp_path / "out" / "index.html").read_text()
     read_as = notes["Juggle a box with both hands."][0].split("'")[1]
@@ -261,7 +262,7 @@ def test_a_second_action_of_a_sentence_is_reported_as_missing(trained: Path, tmp
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
     models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), Wish(frames=8)
     request = Asked("Lift a box and pass it with the left hand.", tmp_path / "box.stl", models=models, wish=wish)
-    note = "a motion is one action: of 'lift', not of 'pass'; ask for each alone"
+    note = "a motion shows one action: this one shows 'lift', not 'pass'; generate each alone"
     assert note in generate_files(request, tmp_path / "out").notes
 
 
@@ -282,7 +283,7 @@ def test_an_unknown_word_is_refused_unless_forced(trained: Path, tmp_path: Path)
     assert "'Lfit' is read as 'lift'" in notes("Lfit the box with the left hand.")
     with pytest.raises(BadInput, match=r"got 'bax'; did you mean 'box'"):
         notes("Lift the bax with the left hand.")
-    assert any("taken for '" in note for note in notes("Throw the ball with the left hand.", force=True))
+    assert any("classified as '" in note for note in notes("Throw the ball with the left hand.", force=True))
 
 
 def test_a_hand_that_the_sentence_does_not_name_is_reported(trained: Path, tmp_path: Path) -> None:
@@ -312,7 +313,9 @@ def test_an_open_mesh_and_a_repaired_one_are_reported(trained: Path, tmp_path: P
         request = Asked("Lift a box with the left hand.", tmp_path / f"{name}.obj", models=models, wish=Wish(frames=8))
         notes[name] = [note for note in generate_files(request, tmp_path / "out").notes if note.startswith("mesh: ")]
     assert notes == {
-        "open": ["mesh: open has no inside: it is open; hands are drawn to its surface, not kept out of it"],
+        "open": [
+            "mesh: open has no inside: it is open; hands are attracted to its surface, but penetration is not prevented"
+        ],
         "turned": ["mesh: turned: triangles turned outward"],
         "whole": [],
     }

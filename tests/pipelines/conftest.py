@@ -1,4 +1,4 @@
-"""A copy of the project in a temporary folder, with the small corpora and budgets of a few steps."""
+"""A copy of the project in a temporary folder, with small corpora and a few training steps."""
 
 import atexit
 import os
@@ -46,12 +46,12 @@ TINY_SAMPLE = {"samples": 2, "text2hoi": {"sampler": {"steps": 2}, "field_resolu
 
 
 def copy_project(folder: Path) -> Path:
-    """The project's code and settings in ``folder``, as a repository of its own; no data, nothing DVC knows of it."""
+    """Copy the project's code and settings into ``folder`` as a new git repository without data and lock files."""
     for part in PARTS:
         source, target = PROJECT / part, folder / part
         target.parent.mkdir(parents=True, exist_ok=True)
         if source.is_dir():
-            # Compiled code comes along: numba takes it where the source's time of change is the same.
+            # The copy includes compiled code, which numba uses if the source has the same modification time.
             shutil.copytree(source, target, ignore=shutil.ignore_patterns("*.tmp.*", "*.pyc.*", "dvc.lock"))
         else:
             shutil.copy(source, target)
@@ -61,7 +61,7 @@ def copy_project(folder: Path) -> Path:
 
 
 def make_small(folder: Path) -> None:
-    """Small corpora, the encoder that needs no weights, and a few steps per model."""
+    """Set small corpora, the hash encoder, and a few training steps per network."""
     for path in (folder / "manifests" / "embedded").glob("*.json"):
         path.write_text(path.read_text().replace('"size": "full"', '"size": "small"'))
     params = yaml.safe_load((folder / "params.yaml").read_text())
@@ -76,7 +76,7 @@ def write_params(folder: Path, params: dict) -> None:
 
 
 def make_narrow(folder: Path, datasets: list[str], families: list[str]) -> None:
-    """No other datasets and families than these in the graph."""
+    """Restrict the graph to some datasets and families."""
     params = yaml.safe_load((folder / "params.yaml").read_text())
     write_params(folder, {**params, "datasets": datasets, "families": families})
     for path in folder.glob("models/*/dvc.yaml"):
@@ -84,15 +84,15 @@ def make_narrow(folder: Path, datasets: list[str], families: list[str]) -> None:
         for stage in stages.values():
             if "family" in stage["matrix"]:
                 stage["matrix"]["family"] = [name for name in stage["matrix"]["family"] if name in families]
-        kept = {name: stage for name, stage in stages.items() if stage["matrix"].get("family") != []}
-        if kept:
-            path.write_text(yaml.safe_dump({"vars": ["../../params.yaml"], "stages": kept}, sort_keys=False))
+        remaining = {name: stage for name, stage in stages.items() if stage["matrix"].get("family") != []}
+        if remaining:
+            path.write_text(yaml.safe_dump({"vars": ["../../params.yaml"], "stages": remaining}, sort_keys=False))
         else:
             path.unlink()
 
 
 def set_present(folder: Path, present: set[str]) -> None:
-    """Make only the named embedded corpora present."""
+    """Mark only the named embedded corpora as present."""
     for name in ("h2o", "grab", "arctic"):
         path = folder / "manifests" / "embedded" / f"{name}.json"
         text = path.read_text().replace('"present": true', '"present": false')
@@ -100,15 +100,15 @@ def set_present(folder: Path, present: set[str]) -> None:
 
 
 def environment(**more: str) -> dict[str, str]:
-    """This environment without the user's raw folders, and with this Python first on the path."""
-    kept = {key: value for key, value in os.environ.items() if not key.startswith(("HOIDATA_", "PREFECT_"))}
-    path = f"{Path(sys.executable).parent}{os.pathsep}{kept.get('PATH', '')}"
-    return {**kept, "PATH": path, "OMP_NUM_THREADS": "1", "DVC_NO_ANALYTICS": "1", "DO_NOT_TRACK": "1", **more}
+    """The environment variables without the user's raw folders, and with this Python first on the path."""
+    variables = {key: value for key, value in os.environ.items() if not key.startswith(("HOIDATA_", "PREFECT_"))}
+    path = f"{Path(sys.executable).parent}{os.pathsep}{variables.get('PATH', '')}"
+    return {**variables, "PATH": path, "OMP_NUM_THREADS": "1", "DVC_NO_ANALYTICS": "1", "DO_NOT_TRACK": "1", **more}
 
 
 @cache
 def warm_process() -> WarmProcess:
-    """One for all tests of a worker: the stages DVC runs need not load torch anew."""
+    """A warm process for all tests of a worker, so that stages do not import torch again."""
     process = WarmProcess()
     process.start()
     atexit.register(process.close)
@@ -116,7 +116,7 @@ def warm_process() -> WarmProcess:
 
 
 def run(folder: Path, *command: str, **more: str) -> subprocess.CompletedProcess:
-    """Run a command as a user would type it, in the project folder."""
+    """Run a command in the project folder."""
     warm = warm_process().environment if command[:2] == ("dvc", "repro") else {}
     return subprocess.run(command, cwd=folder, env=environment(**warm, **more), capture_output=True, text=True)
 
@@ -128,7 +128,7 @@ def project(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def stage_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict]:
-    """Call it with settings: the current folder gets manifests and params; the encoder is one that needs no weights."""
+    """A function that writes manifests and params.yaml with some settings to the current folder."""
     shutil.copytree(PROJECT / "manifests" / "embedded", tmp_path / "manifests" / "embedded")
     monkeypatch.chdir(tmp_path)
     delivered = yaml.safe_load((PROJECT / "params.yaml").read_text())
@@ -144,7 +144,7 @@ def stage_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..
 
 @pytest.fixture(scope="session")
 def built_once(made_once) -> Path:
-    """A project after ``dvc repro`` with GRAB present and ARCTIC not."""
+    """A project after ``dvc repro``, with GRAB present and ARCTIC absent."""
 
     def build(folder: Path) -> None:
         copy_project(folder)
@@ -164,6 +164,6 @@ def built(built_once: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def project_tools() -> SimpleNamespace:
-    """The functions above, for tests: test modules cannot import a conftest."""
+    """The functions above, for test modules, which cannot import a conftest."""
     tools = (copy_project, make_narrow, set_present, write_params, environment, run)
     return SimpleNamespace(**{tool.__name__: tool for tool in tools})

@@ -1,4 +1,4 @@
-"""`hoidata up` in a copy of the project, for the tests that need it running."""
+"""A running `hoidata up` in a copy of the project, for tests."""
 
 import signal
 import socket
@@ -11,13 +11,13 @@ from types import SimpleNamespace
 
 import psutil
 
-START_S = 600  # a busy machine takes its time
+START_S = 600  # a busy machine is slow
 STOP_S = 60
 
 
 @contextmanager
 def hoidata_up(project: Path, tools: SimpleNamespace) -> Iterator[SimpleNamespace]:
-    """Gives ``url``, ``settings`` (variables for `prefect`), ``log`` and ``process`` once a run can be started."""
+    """A running `hoidata up`: ``url``, ``settings`` (variables for `prefect`), ``log`` and ``process``."""
     url = f"http://127.0.0.1:{free_port()}/api"
     settings = {"PREFECT_API_URL": url}
     log = project.parent / "up.log"
@@ -34,9 +34,9 @@ def hoidata_up(project: Path, tools: SimpleNamespace) -> Iterator[SimpleNamespac
 
 
 def running_engine(project: Path, tools: SimpleNamespace, up: SimpleNamespace) -> psutil.Process:
-    """Start the deployment annotate-arctic; the process of its flow, once it has begun to run stages."""
-    asked = tools.run(project, "prefect", "deployment", "run", "annotate-arctic", **up.settings)
-    assert asked.returncode == 0, asked.stdout + asked.stderr
+    """Start the deployment annotate-arctic, and return the process of its flow when it runs stages."""
+    result = tools.run(project, "prefect", "deployment", "run", "annotate-arctic", **up.settings)
+    assert result.returncode == 0, result.stdout + result.stderr
     wait_until(lambda: any(engine.children() for engine in engines(up)), START_S, up.process, up.log)
     return next(engine for engine in engines(up) if engine.children())
 
@@ -48,7 +48,7 @@ def engines(up: SimpleNamespace) -> list[psutil.Process]:
 
 
 def wait_until(holds, seconds: float, process: subprocess.Popen, log: Path) -> None:
-    """Wait while ``process`` lives."""
+    """Wait until a condition holds; fails if ``process`` ends before."""
     deadline = time.monotonic() + seconds
     while not holds():
         assert process.poll() is None, log.read_text()

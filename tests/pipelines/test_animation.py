@@ -1,4 +1,4 @@
-"""`hoidata animate` as docs/fingers.md types it, in a tiny project with a tiny network, and its answers to the rest."""
+"""`hoidata animate` with the commands of docs/fingers.md, in a tiny project with a tiny network, and its messages."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,20 +31,24 @@ TINY = {
 }
 TRAINED, HELD_OUT, LOST = "toy/s1/0", "toy/s2/1", "toy/s3/2"
 FRAMES, BOX_M = 40, (0.06, 0.06, 0.1)
-GIVEN = ("object_translation_m", "object_rotvec", "wrist_m", "global_orient")
 
 
 def clips(seed: int | None = None) -> list[Clip]:
-    """One per split. The last one's hand is lost in frames 20 to 24. seed: of random fingers in place of its own."""
-    plans = enumerate(("s1", "s2", "s3"))
-    made = [build_clip(FRAMES, seed=n, clip_id=f"toy/{who}/{n}", subject=who) for n, who in plans]
-    seen = np.ones(FRAMES, bool)
-    seen[20:25] = False
-    made[2] = changed(made[2], valid=seen, wrist_m=np.where(seen[:, None], made[2].hands["right"].wrist_m, 0))
+    """One clip per subset. The last one's hand is untracked in frames 20 to 24. seed: of random finger poses."""
+    subjects = enumerate(("s1", "s2", "s3"))
+    built = [
+        build_clip(FRAMES, seed=number, clip_id=f"toy/{subject}/{number}", subject=subject)
+        for number, subject in subjects
+    ]
+    is_tracked = np.ones(FRAMES, bool)
+    is_tracked[20:25] = False
+    built[2] = changed(
+        built[2], valid=is_tracked, wrist_m=np.where(is_tracked[:, None], built[2].hands["right"].wrist_m, 0)
+    )
     if seed is None:
-        return made
+        return built
     pose = np.random.default_rng(seed).normal(0, 0.5, (FRAMES, 45)).astype(np.float32)
-    return [changed(clip, hand_pose=pose) for clip in made]
+    return [changed(clip, hand_pose=pose) for clip in built]
 
 
 def changed(clip: Clip, **arrays: np.ndarray) -> Clip:
@@ -53,60 +57,63 @@ def changed(clip: Clip, **arrays: np.ndarray) -> Clip:
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A project with one dataset and its network, as the stages leave it."""
+    """A project with one dataset and its trained network."""
     folder = tmp_path_factory.mktemp("tiny")
     (folder / "dvc.yaml").write_text("stages: {}\n")
     (folder / "params.yaml").write_text(yaml.safe_dump({"profile": "embedded", "datasets": ["toy"]}))
     data = write_annotated(folder / "data" / "embedded" / "toy", clips(), points=64)
     train_network(MANIPNET, data, folder / "checkpoints" / "embedded" / "toy" / "manipnet", TINY)
-    write_own(folder)
+    write_user_files(folder)
     return folder
 
 
-def write_own(folder: Path) -> None:
-    """mine.csv and mug.obj in metres; demo1.txt and cyl_med.obj as ManipNet has them: in a mirror, decimetres."""
+def write_user_files(folder: Path) -> None:
+    """Write mine.csv and mug.obj in metres; demo1.txt and cyl_med.obj mirrored and in decimetres, as ManipNet's are."""
     trimesh.creation.box(BOX_M).export(folder / "mug.obj")
     trimesh.creation.box(np.array(BOX_M) * 10).export(folder / "cyl_med.obj")
-    (folder / "mine.csv").write_text(own_csv(HAND))
-    (folder / "demo1.txt").write_text(own_text())
+    (folder / "mine.csv").write_text(csv_text(HAND))
+    (folder / "demo1.txt").write_text(manipnet_text())
 
 
-def own_motion(turn: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Quaternions (w first) and places of a box and of a right wrist beside it, fingers along -y; four frames."""
-    wrist = Rotation.from_matrix(np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) @ turn)
+def object_and_wrist_poses(wrist_axes: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Quaternions wxyz and positions of a box and a right wrist next to it, fingers along -y; four frames."""
+    wrist = Rotation.from_matrix(np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) @ wrist_axes)
     rows = []
     for frame in range(4):
-        thing = np.array([0.01 * frame, 0, 0.5])
-        both = [(Rotation.from_rotvec([0, 0, 0.02 * frame]), thing), (wrist, thing + np.array([0, 0.08, 0.07]))]
-        rows += [(one.as_quat()[[3, 0, 1, 2]], place) for one, place in both]
+        object_m = np.array([0.01 * frame, 0, 0.5])
+        bodies = [(Rotation.from_rotvec([0, 0, 0.02 * frame]), object_m), (wrist, object_m + np.array([0, 0.08, 0.07]))]
+        rows += [(rotation.as_quat()[[3, 0, 1, 2]], position_m) for rotation, position_m in bodies]
     return rows
 
 
-def own_csv(hand: TrackedHand) -> str:
-    rows = own_motion(hand.wrist_from_canonical.T)
+def csv_text(hand: TrackedHand) -> str:
+    rows = object_and_wrist_poses(hand.wrist_from_canonical.T)
     lines = ["time_s," + ",".join(f"{body}_{part}" for body in ("object", "right") for part in PARTS)]
     for frame in range(4):
-        numbers = [[frame / 30], *(part for turn, place in rows[2 * frame : 2 * frame + 2] for part in (place, turn))]
+        numbers = [
+            [frame / 30],
+            *(part for quaternion, position_m in rows[2 * frame : 2 * frame + 2] for part in (position_m, quaternion)),
+        ]
         lines.append(",".join(map(str, np.concatenate(numbers))))
     return "\n".join(lines)
 
 
-def own_text() -> str:
-    """The same with canonical axes, x to the other side, the left hand far away; 120 lines a second."""
-    rows, far = own_motion(np.eye(3)), np.array([0, 0, 0, 1, 30.0, 0, 0])
+def manipnet_text() -> str:
+    """The same motion with canonical axes, mirrored in x, the left hand far away; 120 lines per second."""
+    rows, far = object_and_wrist_poses(np.eye(3)), np.array([0, 0, 0, 1, 30.0, 0, 0])
     lines = ["120"]
     for frame in range(4):
-        seen = [
-            np.concatenate([turn[[1, 2, 3, 0]] * [1, -1, -1, 1], place * [-10, 10, 10]])
-            for turn, place in rows[2 * frame : 2 * frame + 2]
+        bodies = [
+            np.concatenate([quaternion[[1, 2, 3, 0]] * [1, -1, -1, 1], position_m * [-10, 10, 10]])
+            for quaternion, position_m in rows[2 * frame : 2 * frame + 2]
         ]
-        lines.append(",".join(map(str, np.concatenate([seen[0], far, seen[1]]))))
+        lines.append(",".join(map(str, np.concatenate([bodies[0], far, bodies[1]]))))
     return "\n".join(lines)
 
 
 @pytest.fixture
 def typed(tiny: Path, monkeypatch: pytest.MonkeyPatch):
-    """Types ``hoidata animate`` in the project; gives motion.npz's arrays and the page, or raises its error."""
+    """A function that runs ``hoidata animate`` in the project; returns the arrays of motion.npz and the page."""
     monkeypatch.chdir(tiny)
 
     def run(*words: str) -> tuple[dict[str, np.ndarray], str]:
@@ -129,14 +136,14 @@ def test_a_csv_with_a_mesh_keeps_its_wrist_and_object(typed) -> None:
     assert "SYNTHETIC" not in page
 
 
-def test_manipnets_text_with_a_mesh_in_its_unit_is_seen_in_the_mirror(typed) -> None:
+def test_manipnets_text_file_and_mesh_are_mirrored(typed) -> None:
     arrays, page = typed("demo1.txt", "--object", "cyl_med.obj")
     np.testing.assert_allclose(arrays["wrist_m"][1] - arrays["object_translation_m"], [[0, 0.08, 0.07]], atol=1e-6)
     assert arrays["made"].tolist() == [[False], [True]]
     assert "the left hand stays" in page
 
 
-def test_a_clip_with_frames_and_fingers_keeps_all_else(typed) -> None:
+def test_an_animated_clip_keeps_everything_but_the_chosen_fingers_and_frames(typed) -> None:
     arrays, page = typed(TRAINED, "--fingers", "right", "--frames", "10:30", "--way", "network")
     clip = clips()[0]
     np.testing.assert_allclose(arrays["object_translation_m"], clip.object.translation_m, atol=1e-6)
@@ -144,39 +151,39 @@ def test_a_clip_with_frames_and_fingers_keeps_all_else(typed) -> None:
     assert np.flatnonzero(arrays["made"][1]).tolist() == list(range(10, 30))
     assert not arrays["made"][0].any()
     assert "the network trained on this clip" in page
-    assert "led over 1 s to the known pose before and after" in page
+    assert "blended over 1 s with the known pose before and after" in page
 
 
-def test_random_fingers_in_the_recording_give_the_same_bytes(tiny: Path, typed) -> None:
+def test_recorded_fingers_do_not_affect_the_animation(tiny: Path, typed) -> None:
     typed(HELD_OUT)
     before = (tiny / "out" / "motion.npz").read_bytes()
-    data, kept = tiny / "data" / "embedded" / "toy", tiny / "kept"
-    data.rename(kept)
+    data, backup = tiny / "data" / "embedded" / "toy", tiny / "kept"
+    data.rename(backup)
     try:
         write_annotated(data, clips(seed=3), points=64)
         typed(HELD_OUT)
         assert (tiny / "out" / "motion.npz").read_bytes() == before
     finally:
-        data.rename(tiny / "spoilt")
-        kept.rename(data)
+        data.rename(tiny / "random_fingers")
+        backup.rename(data)
 
 
-def test_a_short_gap_is_interpolated_and_a_lost_hand_is_told(typed) -> None:
+def test_a_short_gap_is_interpolated_and_an_untracked_hand_is_reported(typed) -> None:
     arrays, page = typed(LOST, "--fingers", "right", "--frames", "15:30")
     assert "interpolated between the known poses" in page
-    assert "had been lost in 5 of the 15 frames" in page
+    assert "is not tracked in 5 of the 15 frames" in page
     wrist = clips()[2].hands["right"].wrist_m
     np.testing.assert_allclose(arrays["wrist_m"][1, 20:25], wrist[[19, 19, 19, 25, 25]], atol=1e-6)
 
 
-def test_motion_of_a_network_of_synthetic_clips_is_marked(tiny: Path, typed, monkeypatch) -> None:
+def test_motion_of_a_network_trained_on_synthetic_clips_is_marked(tiny: Path, typed, monkeypatch) -> None:
     import pipelines.animation as animation
 
     chosen = animation.chosen_network
 
-    def synthetic(*given):
-        found = chosen(*given)
-        return replace(found, known={**found.known, "synthetic": True})
+    def synthetic(*arguments):
+        network = chosen(*arguments)
+        return replace(network, facts={**network.facts, "synthetic": True})
 
     monkeypatch.setattr(animation, "chosen_network", synthetic)
     assert "SYNTHETIC" in typed("mine.csv", "--object", "mug.obj")[1]
@@ -187,17 +194,17 @@ def test_motion_of_a_network_of_synthetic_clips_is_marked(tiny: Path, typed, mon
     [
         (("mine.csv", "--object", "mug.obj", "--fingers", "left"), "mine.csv has right, near the object right"),
         (("demo1.txt", "--object", "cyl_med.obj", "--fingers", "left"), "has left and right, near the object right"),
-        (("mine.csv", "--object", "mug.obj", "--way", "interpolate"), "no poses to go between"),
+        (("mine.csv", "--object", "mug.obj", "--way", "interpolate"), "no poses to interpolate between"),
         (("mine.csv", "--object", "mug.obj", "--model", "nope"), "params.yaml: toy, got nope"),
         (("mine.cvs",), r"\.csv, \.npz, \.txt"),
         (("demo1.txt.gz",), "gunzip"),
-        ((TRAINED, "--object", "mug.obj"), "--object: expected nothing beside a clip"),
-        ((TRAINED, "--world-up", "z"), "--world-up: expected nothing beside a clip"),
-        ((TRAINED, "--trajectory-unit", "cm"), "--trajectory-unit: expected nothing beside a clip"),
+        ((TRAINED, "--object", "mug.obj"), "--object: expected no such option with a clip"),
+        ((TRAINED, "--world-up", "z"), "--world-up: expected no such option with a clip"),
+        ((TRAINED, "--trajectory-unit", "cm"), "--trajectory-unit: expected no such option with a clip"),
         ((TRAINED, "--frames", "0:9", "--way", "interpolate"), "known poses on both sides"),
         (("toy/s1/9",), "closest: toy/s1/0"),
     ],
 )
-def test_what_does_not_fit_is_told(typed, words: tuple[str, ...], answer: str) -> None:
+def test_unusable_options_are_refused(typed, words: tuple[str, ...], answer: str) -> None:
     with pytest.raises(BadInput, match=answer):
         typed(*words)

@@ -1,6 +1,6 @@
-"""Nothing is lost: whatever stops a run, outputs that were there stay, it says what to do, the next run ends the same.
+"""Interrupted runs and damaged files: existing outputs stay, the message has a remedy, the next run completes.
 
-`make chaos` stages everything three times; `make test` has the cheaper situations once.
+`make chaos` runs all cases three times; `make test` runs the cheap ones once.
 """
 
 import contextlib
@@ -32,9 +32,9 @@ from tests.pipelines.prefect_up import hoidata_up, wait_until
 from tests.pipelines.test_interrupts import is_at_work, until
 
 IS_CHAOS = "HOIDATA_CHAOS" in os.environ
-TURNS = range(int(os.environ.get("HOIDATA_CHAOS", "1")))
+REPETITIONS = range(int(os.environ.get("HOIDATA_CHAOS", "1")))
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarning")]
-every_turn = pytest.mark.parametrize("turn", TURNS)
+repeated = pytest.mark.parametrize("repetition", REPETITIONS)
 only_in_chaos = pytest.mark.skipif(not IS_CHAOS, reason="`make chaos` stages it")
 in_namespace = pytest.mark.skipif(
     subprocess.run(["unshare", "-m", "true"], capture_output=True).returncode != 0,
@@ -50,17 +50,17 @@ STAGES = {
     "sample": ("sample", *GRAB, "--family", "text2hoi"),
 }
 OUTPUTS = ("data/embedded", "checkpoints/embedded", "samples/embedded", "metrics/embedded", "report/embedded")
-EDITED: dict[Path, str] = {}  # by a test under way, with what was there
+EDITED: dict[Path, str] = {}  # used by a running test, with the digests before it
 
 
 @pytest.fixture(autouse=True)
 def _kept(built) -> Iterator[None]:
-    """Every output is after a test, and with it after the run that completes, what it was before."""
+    """Check that all outputs have the same digests before and after each test."""
     before = outputs(built)
     assert len(before) == len(OUTPUTS)
     yield
     assert outputs(built) == before
-    if EDITED:  # a checkpoint's header names the code of every stage behind it
+    if EDITED:  # a checkpoint's header has the code of all stages behind it
         for path, text in EDITED.items():
             path.write_text(text)
         EDITED.clear()
@@ -68,13 +68,13 @@ def _kept(built) -> Iterator[None]:
 
 
 def outputs(project: Path) -> dict[str, str | None]:
-    """Digest of every kind of output, as DVC counts: without what a killed run left beside them."""
+    """Digests of the outputs, as DVC computes them: without unfinished files of a killed run."""
     return {name: dvc_digest(project / name) for name in OUTPUTS}
 
 
 @pytest.fixture
 def typed(built, project_tools):
-    """Call it with a command: what came of it. It must not end in a traceback."""
+    """A function that runs a command and returns its result; fails if there is a traceback."""
 
     def run(*command: str, **more) -> subprocess.CompletedProcess:
         done = subprocess.run(
@@ -88,21 +88,21 @@ def typed(built, project_tools):
 
 @pytest.fixture
 def begun(built, project_tools):
-    """Call it with a command that is to be disturbed: its process, in a group of its own; stdout and stderr are one."""
+    """A function that starts a command in a new process group, with stderr in stdout, and returns the process."""
     started: list[subprocess.Popen] = []
 
     def start(*command: str, **environment: str) -> subprocess.Popen:
-        told = (built.parent / f"told-{len(started)}.log").open("w+b")
+        output = (built.parent / f"output-{len(started)}.log").open("w+b")
         process = subprocess.Popen(
             command,
             cwd=built,
             env=project_tools.environment(**environment),
-            stdout=told,
-            stderr=told,
+            stdout=output,
+            stderr=output,
             start_new_session=True,
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         )
-        process.told = Path(told.name)  # pyright: ignore
+        process.output = Path(output.name)  # pyright: ignore
         started.append(process)
         return process
 
@@ -114,7 +114,7 @@ def begun(built, project_tools):
 
 
 def make_stale(project: Path, stage: str) -> None:
-    """The stage has to run again, and gives the same."""
+    """Make the stage stale without changing its result."""
     path = project / f"pipelines/stages/{stage}.py"
     EDITED.setdefault(path, path.read_text())
     path.write_text(f"{path.read_text()}# edited {time.time_ns()}\n")
@@ -129,19 +129,19 @@ def text_of(log: Path) -> str:
     return log.read_text(errors="replace") if log.is_file() else ""
 
 
-def moment(turn: int, least: float, most: float) -> float:
-    return random.Random(turn).uniform(least, most)
+def moment(repetition: int, least: float, most: float) -> float:
+    return random.Random(repetition).uniform(least, most)
 
 
-@every_turn
-@pytest.mark.parametrize("what", ["absent", "changed", "one gone"] if IS_CHAOS else ["one gone"])
-def test_raw_data_that_is_absent_or_changed_meanwhile_stops_a_conversion(built, typed, turn, what):
+@repeated
+@pytest.mark.parametrize("damage", ["absent", "changed", "one gone"] if IS_CHAOS else ["one gone"])
+def test_absent_or_changed_raw_files_stop_a_conversion(built, typed, repetition, damage):
     raw, aside = built / ".hoidata/raw/embedded/grab", built / "aside"
-    file = sorted(raw.glob("grab/*/*.npz"))[turn]
+    file = sorted(raw.glob("grab/*/*.npz"))[repetition]
     whole = file.read_bytes()
-    if what == "absent":
+    if damage == "absent":
         shutil.move(raw, aside)
-    elif what == "changed":
+    elif damage == "changed":
         file.write_bytes(whole[:200] + bytes([whole[200] ^ 1]) + whole[201:])
     else:
         file.unlink()
@@ -153,9 +153,9 @@ def test_raw_data_that_is_absent_or_changed_meanwhile_stops_a_conversion(built, 
         "changed": "restore the file",
         "one gone": "1 gone, first",
     }
-    assert remedy[what] in done.stderr
+    assert remedy[damage] in done.stderr
     assert outputs(built) == before
-    if what == "absent":
+    if damage == "absent":
         shutil.move(aside, raw)
     else:
         file.write_bytes(whole)
@@ -163,11 +163,11 @@ def test_raw_data_that_is_absent_or_changed_meanwhile_stops_a_conversion(built, 
 
 
 @only_in_chaos
-@every_turn
+@repeated
 @pytest.mark.parametrize("stage", ["convert", "contact", "train", "sample"])
-def test_a_stage_that_is_killed_leaves_what_was_there(built, typed, begun, turn, stage):
+def test_a_killed_stage_leaves_its_old_output(built, typed, begun, repetition, stage):
     process = begun(*STAGE, *STAGES[stage], HOIDATA_JOBS="2")
-    time.sleep(moment(turn, 0.5, 4))
+    time.sleep(moment(repetition, 0.5, 4))
     before = outputs(built)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
@@ -176,44 +176,45 @@ def test_a_stage_that_is_killed_leaves_what_was_there(built, typed, begun, turn,
 
 
 @only_in_chaos
-@every_turn
-def test_a_worker_that_is_killed_costs_nothing_but_its_time(built, begun, turn):
+@repeated
+def test_a_killed_worker_does_not_change_the_result(built, begun, repetition):
     process = begun(*STAGE, *STAGES["convert"], HOIDATA_JOBS="2")
     parent = psutil.Process(process.pid)
     workers: list[psutil.Process] = []
     while process.poll() is None and len(workers) < 2:
         workers = [child for child in parent.children() if "spawn_main" in " ".join(child.cmdline())]
-    time.sleep(moment(turn, 0, 2))
+    time.sleep(moment(repetition, 0, 2))
     with contextlib.suppress(psutil.NoSuchProcess):
-        workers[turn % 2].kill()
-    assert process.wait(120) == 0, process.told.read_text()  # pyright: ignore
+        workers[repetition % 2].kill()
+    assert process.wait(120) == 0, process.output.read_text()  # pyright: ignore
 
 
-@every_turn
+@repeated
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL] if IS_CHAOS else [signal.SIGINT])
-def test_a_run_that_is_interrupted_or_killed_takes_its_stages_along(built, typed, begun, turn, sent):
+def test_the_stages_of_an_interrupted_or_killed_run_end_with_it(built, typed, begun, repetition, sent):
     make_stale(built, "convert")
     log = built / log_of(CONVERT)
     log.unlink(missing_ok=True)
     process = begun("hoidata", "repro", CONVERT)
-    wait_until(lambda: "Running stage" in text_of(log), 60, process, process.told)
-    time.sleep(moment(turn, 0, 2))
+    wait_until(lambda: "Running stage" in text_of(log), 60, process, process.output)
+    time.sleep(moment(repetition, 0, 2))
     children = psutil.Process(process.pid).children(recursive=True)
     os.kill(process.pid, sent)
     code = process.wait(60)
-    told = process.told.read_text()
+    output = process.output.read_text()
     if sent != signal.SIGKILL:
-        assert (code, "run it again" in told, "Traceback" in told) == (128 + sent, True, False), told
-    until(lambda: not any(map(is_at_work, children)), 30)  # else stages go on although nobody waits for them
+        assert (code, "run it again" in output, "Traceback" in output) == (128 + sent, True, False), output
+    # Otherwise stages continue although no process waits for them.
+    until(lambda: not any(map(is_at_work, children)), 30)
     completes(typed, CONVERT)
 
 
 @only_in_chaos
-@every_turn
+@repeated
 @pytest.mark.parametrize("stage", ["convert", "contact", "train"])
-def test_a_disk_that_takes_no_more_is_told_and_costs_nothing(built, typed, turn, stage):
-    """A limit on the length of files stands for a full disk: writing stops in the middle, the file stays cut."""
-    most = (3_000, 30_000, 100_000)[turn]
+def test_a_write_error_is_reported_and_leaves_the_old_outputs(built, typed, repetition, stage):
+    """A limit on the file size simulates a full disk: writing stops, and a partial file remains."""
+    most = (3_000, 30_000, 100_000)[repetition]
     before = outputs(built)
     done = typed(*STAGE, *STAGES[stage], preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (most, most)))
     assert (done.returncode, "room" in done.stderr) == (1, True), done.stderr
@@ -223,14 +224,14 @@ def test_a_disk_that_takes_no_more_is_told_and_costs_nothing(built, typed, turn,
 
 @only_in_chaos
 @in_namespace
-@every_turn
+@repeated
 @pytest.mark.parametrize("stage", ["convert", "contact", "train"])
-def test_a_disk_that_is_full_is_told_and_costs_nothing(built, typed, turn, stage):
-    """The folder of the outputs is a small disk of its own with next to no room left."""
+def test_a_full_disk_is_reported_and_leaves_the_old_outputs(built, typed, repetition, stage):
+    """The folder of the outputs is a small file system that is almost full."""
     folder = "checkpoints/embedded/grab" if stage == "train" else "data/embedded/grab"
     script = f"""
         set -e
-        room=$(( $(du -sk {folder} | cut -f1) + {(8, 24, 60)[turn]} ))
+        room=$(( $(du -sk {folder} | cut -f1) + {(8, 24, 60)[repetition]} ))
         mount -t tmpfs -o size=${{room}}k none /mnt
         cp -a {folder}/. /mnt/
         mount --bind /mnt {folder}
@@ -252,8 +253,8 @@ def test_a_disk_that_is_full_is_told_and_costs_nothing(built, typed, turn, stage
 
 @only_in_chaos
 @in_namespace
-@every_turn
-def test_a_cache_that_cannot_be_written_is_told_before_anything_runs(built, typed, turn):
+@repeated
+def test_an_unwritable_cache_is_reported_before_any_stage_runs(built, typed, repetition):
     make_stale(built, "contact")
     before = outputs(built)
     script = "mount --bind .dvc/cache .dvc/cache && mount -o remount,ro,bind .dvc/cache && hoidata repro " + CONTACT
@@ -265,26 +266,28 @@ def test_a_cache_that_cannot_be_written_is_told_before_anything_runs(built, type
 
 
 @only_in_chaos
-@every_turn
-def test_of_two_runs_at_once_the_second_says_so_and_the_first_completes(built, typed, begun, turn):
+@repeated
+def test_a_second_run_in_parallel_is_refused_and_the_first_completes(built, typed, begun, repetition):
     make_stale(built, "convert")
     first = begun("hoidata", "repro", CONVERT)
-    wait_until(lambda: (built / ".hoidata/.repro.lock").is_file(), 60, first, first.told)
-    time.sleep(moment(turn, 0.5, 2))
-    os.kill(first.pid, signal.SIGSTOP)  # else it may be done before the second has begun
+    wait_until(lambda: (built / ".hoidata/.repro.lock").is_file(), 60, first, first.output)
+    time.sleep(moment(repetition, 0.5, 2))
+    os.kill(first.pid, signal.SIGSTOP)  # otherwise it may end before the second starts
     second = typed("hoidata", "repro", CONVERT)
     os.kill(first.pid, signal.SIGCONT)
     assert (second.returncode, "wait for that run to end" in second.stderr) == (1, True), second.stderr
-    stage = typed(*STAGE, *STAGES["convert"])  # the same stage by hand, which may come before or after
+    stage = typed(*STAGE, *STAGES["convert"])  # the same stage from the command line, which may start before or after
     assert stage.returncode == 0 or "at work on it" in stage.stderr
-    assert first.wait(120) == 0, first.told.read_text()
+    assert first.wait(120) == 0, first.output.read_text()
     completes(typed, CONVERT)
 
 
 @only_in_chaos
-@every_turn
+@repeated
 @pytest.mark.parametrize("killed", ["server", "hoidata up"])
-def test_a_server_that_is_gone_costs_no_output_and_a_run_by_hand_completes(built, project_tools, typed, turn, killed):
+def test_without_the_prefect_server_outputs_stay_and_a_run_from_the_command_line_completes(
+    built, project_tools, typed, repetition, killed
+):
     make_stale(built, "convert")
     with hoidata_up(built, project_tools) as up:
         started = project_tools.run(built, "prefect", "deployment", "run", "convert-grab", **up.settings)
@@ -294,7 +297,7 @@ def test_a_server_that_is_gone_costs_no_output_and_a_run_by_hand_completes(built
         wait_until(
             lambda: log.is_file() and "Running stage" in log.read_text(errors="replace"), 120, up.process, up.log
         )
-        time.sleep(moment(turn, 0, 2))
+        time.sleep(moment(repetition, 0, 2))
         children = psutil.Process(up.process.pid).children(recursive=True)
         if killed == "server":
             for child in (one for one in psutil.Process(up.process.pid).children() if "server" in one.cmdline()):
@@ -303,14 +306,14 @@ def test_a_server_that_is_gone_costs_no_output_and_a_run_by_hand_completes(built
             up.process.kill()
         time.sleep(2)
     _, alive = psutil.wait_procs(children, 30)
-    assert not alive, "a worker and a flow run obey whoever listens at the address next"
+    assert not alive, "a worker and a flow run obey the next server at the address"
     completes(typed, CONVERT)
 
 
-def flipped(data: bytes, turn: int) -> bytes:
-    """One bit changed, in the middle of the file."""
-    place = len(data) // 2 + turn
-    return data[:place] + bytes([data[place] ^ 1 << turn % 8]) + data[place + 1 :]
+def flipped(data: bytes, repetition: int) -> bytes:
+    """Flip one bit in the middle of a file."""
+    index = len(data) // 2 + repetition
+    return data[:index] + bytes([data[index] ^ 1 << repetition % 8]) + data[index + 1 :]
 
 
 DAMAGED = {
@@ -323,14 +326,16 @@ DAMAGED = {
 }
 
 
-@every_turn
+@repeated
 @pytest.mark.parametrize("kind", DAMAGED)
-def test_one_changed_byte_is_named_by_validate_and_check_and_no_reader_shows_it(built, monkeypatch, turn, kind):
+def test_one_changed_byte_is_reported_by_validate_and_check_and_refused_by_readers(
+    built, monkeypatch, repetition, kind
+):
     monkeypatch.chdir(built)
     name, reader = DAMAGED[kind]
     path = built / name
     whole = path.read_bytes()
-    path.write_bytes(flipped(whole, turn))
+    path.write_bytes(flipped(whole, repetition))
     verify_with(written_digest)
     try:
         for words in (["validate", str(path.parent)], ["lineage", "check", str(path)]):
@@ -352,7 +357,7 @@ def test_one_changed_byte_is_named_by_validate_and_check_and_no_reader_shows_it(
         path.write_bytes(whole)
 
 
-def test_facts_without_an_entry_name_it_and_the_file(built):
+def test_a_missing_entry_of_a_json_file_is_reported_with_its_name_and_the_file(built):
     from hoidata.store.store import open_store
 
     path = built / "data/embedded/grab/clips/meta/info.json"
@@ -362,7 +367,7 @@ def test_facts_without_an_entry_name_it_and_the_file(built):
             open_store(path.parents[1])
 
 
-def test_names_that_are_not_utf_8_are_told_and_not_raised(built, typed, tmp_path):
+def test_file_names_that_are_not_utf_8_give_a_message_instead_of_a_traceback(built, typed, tmp_path):
     for words in (["validate"], ["lineage"], ["generate", "Lift it.", "--out", "out", "--object"])[not IS_CHAOS :]:
         done = typed("hoidata", *words, os.fsdecode(b"b\xffd.obj"))
         assert done.returncode in (1, 2)
@@ -395,7 +400,7 @@ print(done.clips, len(done.quarantined), done.quarantined[0].remedy)
         (MemoryError("Unable to allocate 7 GiB"), "lower --jobs"),
     ],
 )
-def test_trouble_of_the_machine_says_what_to_do_and_a_defect_stays_one(error, words):
+def test_machine_errors_have_a_remedy_and_other_errors_are_raised(error, words):
     with pytest.raises(MachineTrouble, match=words), told_in_words():
         raise error
     for defect in (FileNotFoundError(2, "No such file", "a"), ValueError("disk")):

@@ -1,4 +1,4 @@
-"""Another text encoder, a tiny random CLIP, in a built project: words and models are made again, motion data is not."""
+"""A change of the text encoder to a tiny random CLIP runs text and training stages again, but no motion stages."""
 
 import json
 import os
@@ -22,7 +22,7 @@ GENERATE = ("hoidata", "generate", "Lift it with the left hand.", "--object")
 
 
 def write_tiny_clip(path: Path) -> None:
-    """A random text tower of two layers, as open_clip builds and names it."""
+    """Write a random text tower of two layers with the names of open_clip."""
     import torch
     from safetensors.torch import save_file
 
@@ -46,7 +46,7 @@ def outputs(stage: dict) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def before_and_after(built: Path, project_tools) -> tuple[Path, dict, dict, str]:
-    """The project, its locks before and after the change of encoder, and what the second run said."""
+    """The project, its locks before and after the change of encoder, and the output of the second run."""
     folder = built
     before = lock(folder)
     write_tiny_clip(folder / "tiny.safetensors")
@@ -58,7 +58,7 @@ def before_and_after(built: Path, project_tools) -> tuple[Path, dict, dict, str]
     return folder, before, lock(folder), second.stdout
 
 
-def test_stages_of_the_motion_do_not_run_and_keep_their_outputs(before_and_after) -> None:
+def test_motion_stages_do_not_run_again(before_and_after) -> None:
     _, before, after, said = before_and_after
     for name in before:
         if name.startswith(MOTION):
@@ -66,7 +66,7 @@ def test_stages_of_the_motion_do_not_run_and_keep_their_outputs(before_and_after
             assert f"Running stage '{name}'" not in said
 
 
-def test_words_and_models_are_made_again_and_the_parts_stay_the_same(before_and_after) -> None:
+def test_text_and_training_stages_run_again_and_the_subsets_stay_the_same(before_and_after) -> None:
     _, before, after, _ = before_and_after
     changed = {path for name in before for path, digest in outputs(after[name]).items()
                if outputs(before[name])[path] != digest}  # fmt: skip
@@ -77,7 +77,7 @@ def test_words_and_models_are_made_again_and_the_parts_stay_the_same(before_and_
                        "report/embedded"}  # fmt: skip
 
 
-def test_features_and_checkpoints_say_that_they_are_clips(before_and_after) -> None:
+def test_features_and_checkpoints_name_the_encoder_clip(before_and_after) -> None:
     folder, _, _, _ = before_and_after
     identity = json.loads((folder / "data/embedded/grab/annotation/info.json").read_text())["encoder"]
     assert (identity["name"], identity["quick_gelu"], identity["dims"]) == ("clip-text-64x2", True, 512)
@@ -88,16 +88,16 @@ def test_features_and_checkpoints_say_that_they_are_clips(before_and_after) -> N
     assert metadata["facts"]["encoder"] == identity
 
 
-def test_nothing_is_left_to_do_and_the_models_generate_with_their_own_encoder_alone(
+def test_all_stages_are_up_to_date_and_the_models_generate_only_with_their_encoder(
     before_and_after, project_tools, tmp_path: Path
 ) -> None:
     folder, *_ = before_and_after
     assert project_tools.run(folder, "dvc", "repro").stdout.count("Running stage") == 1  # code, which always runs
     params = (folder / "params.yaml").read_text()
-    thing = str(pd.read_parquet(folder / "data/embedded/grab/clips/meta/objects.parquet")["object"][0])
-    generate = (*GENERATE, thing, "--model", "grab")
-    made = project_tools.run(folder, *generate, "--out", str(tmp_path / "made"))
-    assert made.returncode == 0, made.stdout + made.stderr
+    object_name = str(pd.read_parquet(folder / "data/embedded/grab/clips/meta/objects.parquet")["object"][0])
+    generate = (*GENERATE, object_name, "--model", "grab")
+    result = project_tools.run(folder, *generate, "--out", str(tmp_path / "made"))
+    assert result.returncode == 0, result.stdout + result.stderr
     assert "left (decided by rule" in (tmp_path / "made" / "index.html").read_text()
     plain = project_tools.run(folder, *generate, "--hand-by", "similarity", "--out", str(tmp_path / "plain"))
     assert plain.returncode == 0, plain.stdout + plain.stderr

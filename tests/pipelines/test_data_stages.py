@@ -1,4 +1,4 @@
-"""The data stages as dvc.yaml runs them: every setting of params.yaml reaches the library."""
+"""The data stages as dvc.yaml runs them: all settings of params.yaml reach the library."""
 
 import json
 from dataclasses import asdict, replace
@@ -28,7 +28,7 @@ from pipelines.params import read_file
 from pipelines.stages import annotate, contact, quality, split
 from pipelines.stages.adapters import ConvertSettings, ensure_manifests, raw_files
 from pipelines.stages.base import StagePaths, empty_reason, load_settings, write_empty
-from pipelines.stages.code import closures, own_settings
+from pipelines.stages.code import closures, dataset_settings
 from tests.builders import hoi4d
 from tests.builders.clips import jumping
 
@@ -41,18 +41,18 @@ def params_of(folder: Path, text: str) -> ConvertSettings:
     return load_settings(ConvertSettings, "convert", path)
 
 
-def test_the_committed_settings_are_every_adapters_defaults():
+def test_the_committed_settings_are_the_defaults_of_all_adapters():
     params = load_settings(ConvertSettings, "convert", PROJECT / "params.yaml")
     assert params.adapter("grab") == GrabAdapter()
 
 
-def test_a_dataset_may_have_a_margin_of_its_own(tmp_path):
+def test_a_dataset_may_set_its_margin(tmp_path):
     params = params_of(tmp_path, "convert: {margin_frames: 5, adapters: {arctic: {margin_frames: 2}, h2o: null}}")
     margins = {name: getattr(params.adapter(name), "margin_frames", None) for name in ("grab", "arctic", "h2o")}
     assert margins == {"grab": 5, "arctic": 2, "h2o": 5}
 
 
-def test_a_variant_has_the_adapter_and_raw_files_of_its_source_and_settings_of_its_own(tmp_path, monkeypatch):
+def test_a_variant_has_the_adapter_and_raw_files_of_its_source_and_separate_settings(tmp_path, monkeypatch):
     params = params_of(tmp_path, "convert: {adapters: {arctic-whole: {clips: whole}}}")
     assert (params.adapter("arctic").clips, params.adapter("arctic-whole").clips) == ("described", "whole")
     with pytest.raises(MissingResource, match="no adapter 'kitchen'"):
@@ -65,7 +65,7 @@ def test_a_variant_has_the_adapter_and_raw_files_of_its_source_and_settings_of_i
     (tmp_path / "files").mkdir()
     monkeypatch.setenv("HOIDATA_ARCTIC", str(tmp_path / "files"))
     assert raw_files(StagePaths("own", "arctic-whole")) == raw_files(StagePaths("own", "arctic")) == tmp_path / "files"
-    # A generated corpus is each variant's own: its manifest may hold another recipe.
+    # A generated corpus is written per variant, since its manifest may have another recipe.
     with pytest.raises(MissingResource, match=r"\.hoidata/raw/embedded/arctic-whole"):
         raw_files(StagePaths("embedded", "arctic-whole"))
 
@@ -82,7 +82,7 @@ def test_a_folder_with_a_file_per_frame_is_one_entry_of_a_manifest(tmp_path):
         adapter.load(RawTree(root, listed), hoi4d.key_of(hoi4d.SAFE), hoi4d.HANDS)
 
 
-def test_the_code_of_a_variant_is_that_of_its_source_and_its_settings_concern_it_alone():
+def test_a_variant_has_the_code_of_its_source_and_its_settings_concern_it_alone():
     plain = read_file(PROJECT / "params.yaml")
     params = plain | {
         "datasets": ["arctic", "arctic-whole"],
@@ -91,8 +91,8 @@ def test_the_code_of_a_variant_is_that_of_its_source_and_its_settings_concern_it
     starts = closures(params, SourceTree(PROJECT))
     for stage in ("raw", "convert", "split"):
         assert starts[f"{stage}/arctic"] == starts[f"{stage}/arctic-whole"]
-    assert own_settings(params, "convert/arctic") == {"params.yaml convert.adapters.arctic": "null"}
-    assert "whole" in own_settings(params, "convert/arctic-whole")["params.yaml convert.adapters.arctic-whole"]
+    assert dataset_settings(params, "convert/arctic") == {"params.yaml convert.adapters.arctic": "null"}
+    assert "whole" in dataset_settings(params, "convert/arctic-whole")["params.yaml convert.adapters.arctic-whole"]
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_the_code_of_a_variant_is_that_of_its_source_and_its_settings_concern_it
         ("convert: {adapters: {grab: {margin: 1}}}", "settings of the adapter grab.*margin_frames.*got margin"),
     ],
 )
-def test_a_wrong_setting_is_named_with_the_known_ones(tmp_path, text, problem):
+def test_an_unknown_setting_is_refused_with_a_list_of_the_known_ones(tmp_path, text, problem):
     with pytest.raises(BadInput, match=problem):
         params_of(tmp_path, text).adapter("grab")
 
@@ -111,7 +111,7 @@ def test_a_wrong_setting_is_named_with_the_known_ones(tmp_path, text, problem):
 PATHS = StagePaths("embedded", "grab")
 
 
-def test_clip_that_fails_is_listed_with_its_reason_and_not_annotated(stage_folder, make_clip):
+def test_a_clip_that_fails_quality_control_is_listed_with_its_reason_and_not_annotated(stage_folder, make_clip):
     clips = [make_clip(40, seed=3, clip_id=f"test/s1/{number}") for number in range(2)]
     clips[1] = jumping(clips[1], 20, 0.5)
     write_store(PATHS.clips, clips, generated_info("grab"))
@@ -124,7 +124,7 @@ def test_clip_that_fails_is_listed_with_its_reason_and_not_annotated(stage_folde
     assert hands.at["test/s1/1", "reason"].startswith("left out by quality control: largest sudden step of a corner")
 
 
-def test_params_decide_what_is_left_out(stage_folder, make_clip):
+def test_params_set_the_quality_limits(stage_folder, make_clip):
     write_store(PATHS.clips, [make_clip(40, seed=3)], generated_info("grab"))
     stage_folder(quality={"limits": {"size_m": {"leave_out": 0.05}}})
     quality.run(PATHS)
@@ -143,7 +143,7 @@ def test_empty_dataset_passes_through(stage_folder):
     assert empty_reason(PATHS.annotation) == "grab is not present"
 
 
-def test_unknown_setting_and_unknown_measure_are_named(stage_folder, make_clip):
+def test_an_unknown_setting_and_an_unknown_measure_are_refused(stage_folder, make_clip):
     write_store(PATHS.clips, [make_clip(40)], generated_info("grab"))
     stage_folder(quality={"too_deep_mm": 10})
     with pytest.raises(BadInput, match="too_deep_mm"):
@@ -155,7 +155,7 @@ def test_unknown_setting_and_unknown_measure_are_named(stage_folder, make_clip):
 
 @pytest.fixture
 def clips(stage_folder, make_clip):
-    """A clip with a verb and one without in the current folder."""
+    """A store with a clip with and a clip without a verb, in the current folder."""
     clips = [make_clip(40, seed=3, clip_id=f"test/s1/{number}") for number in range(2)]
     write_store(PATHS.clips, [clips[0], replace(clips[1], verb=None)], generated_info("grab"))
     quality.run(PATHS)
@@ -164,7 +164,7 @@ def clips(stage_folder, make_clip):
 
 @pytest.fixture
 def annotated_with(clips, stage_folder):
-    """Call it with settings: hand types and sentences by clip, and the facts, of a run with them."""
+    """A function that annotates with some settings; returns hand types and sentences by clip, and the facts."""
 
     def run(of_contact: dict | None = None, **settings) -> tuple[pd.DataFrame, pd.DataFrame, dict]:
         stage_folder(annotate={"encoder": "hash", **settings}, contact=of_contact or {})
@@ -176,13 +176,13 @@ def annotated_with(clips, stage_folder):
     return run
 
 
-def test_threshold_and_points_of_the_contact_stage_decide_which_hand_acts(annotated_with) -> None:
+def test_threshold_and_points_of_the_contact_stage_decide_the_active_hands(annotated_with) -> None:
     hands, _, info = annotated_with({"threshold_m": 1e-6, "points": 64})
     assert (info["threshold_m"], info["points"]) == (1e-6, 64)
     assert hands["hand_type"].isna().all()
 
 
-def test_hand_types_may_have_a_threshold_of_their_own(annotated_with) -> None:
+def test_hand_types_may_have_another_threshold(annotated_with) -> None:
     hands, _, info = annotated_with({"threshold_m": 1e-6}, threshold_m=0.02)
     assert info["threshold_m"] == 0.02
     assert hands["hand_type"].notna().all()
@@ -193,17 +193,17 @@ def test_the_contact_stage_has_to_run_first(clips) -> None:
         annotate.run(PATHS)
 
 
-def test_forms_are_those_asked_for(clips, annotated_with) -> None:
+def test_sentences_have_the_requested_forms(clips, annotated_with) -> None:
     hands, text, info = annotated_with(forms="reference")
     clip = clips[0]
-    found = text[text["clip_id"] == clip.clip_id]["sentence"].tolist()
-    assert found == list(reference_sentences(clip.verb, clip.object_words, hands.at[clip.clip_id, "hand_type"]))
+    sentences = text[text["clip_id"] == clip.clip_id]["sentence"].tolist()
+    assert sentences == list(reference_sentences(clip.verb, clip.object_words, hands.at[clip.clip_id, "hand_type"]))
     assert info["forms"] == "reference"
     with pytest.raises(BadInput, match="forms"):
         annotated_with(forms="poem")
 
 
-def test_whose_word_counts_for_the_hand_is_written_down_where_it_is_not_the_distances(annotated_with) -> None:
+def test_the_source_of_the_hand_type_is_recorded_unless_it_is_the_distance(annotated_with) -> None:
     rule = "annotated-else-proximity"
     assert [annotated_with(**chosen)[2].get("hand") for chosen in ({}, {"hand": rule})] == [None, rule]
     with pytest.raises(BadInput, match="hand"):
@@ -233,7 +233,7 @@ def test_the_sentences_of_a_dataset_are_printed_by_a_command() -> None:
 
 @pytest.fixture
 def folder(make_clip, tmp_path, monkeypatch):
-    """A project folder with four annotated clips of PATHS, one per subject; the current folder."""
+    """A project folder with four annotated clips, one per subject, as the current folder."""
     monkeypatch.chdir(tmp_path)
     names = ("s1", "s2", "s9", "s10")
     clips = [
@@ -249,7 +249,7 @@ def choose_split(folder, value) -> None:
     (folder / "params.yaml").write_text(yaml.safe_dump({"split": {"grab": value}}))
 
 
-def test_a_name_or_a_rule_of_the_users_own_decides(folder):
+def test_a_split_is_a_name_or_a_rule_in_params(folder):
     choose_split(folder, "text2hoi")
     split.run(PATHS)
     assert pd.read_parquet(PATHS.splits / "splits.parquet")["split"].tolist() == [
@@ -258,7 +258,7 @@ def test_a_name_or_a_rule_of_the_users_own_decides(folder):
         "validation",
         "test",
     ]
-    (folder / "params.yaml").write_text("split: {}")  # then the dataset's own: text2hoi
+    (folder / "params.yaml").write_text("split: {}")  # then the default of the dataset: text2hoi
     split.run(PATHS)
     assert json.loads((PATHS.splits / "info.json").read_text())["chosen"]["name"] == "text2hoi"
     choose_split(folder, {"by": "subject", "train": ["s2"], "validation": ["s1"], "test": ["s9"]})
@@ -269,7 +269,7 @@ def test_a_name_or_a_rule_of_the_users_own_decides(folder):
     assert json.loads((PATHS.splits / "info.json").read_text())["chosen"]["name"] == "params.yaml"
 
 
-def test_parts_without_clips_are_said_with_the_setting(folder, capsys):
+def test_subsets_without_clips_are_reported_with_the_setting(folder, capsys):
     choose_split(folder, {"by": "subject", "train": "rest", "validation": ["s7"], "test": ["s10"]})
     split.run(PATHS)
     said = capsys.readouterr().err.splitlines()
@@ -278,14 +278,14 @@ def test_parts_without_clips_are_said_with_the_setting(folder, capsys):
     assert "split.grab of params.yaml" in said[0]
 
 
-def test_a_name_that_is_not_there_lists_those_that_are(folder):
+def test_an_unknown_split_is_refused_with_a_list_of_the_known_ones(folder):
     choose_split(folder, "text2hio")
     with pytest.raises(BadInput, match=r"params.yaml: split.grab: expected one of: composition, .*official, text2hoi"):
         split.run(PATHS)
     assert not PATHS.splits.exists()
 
 
-def test_a_dataset_without_clips_passes_its_reason_on(folder):
+def test_a_dataset_without_clips_passes_on_its_reason(folder):
     choose_split(folder, "text2hoi")
     empty = StagePaths("embedded", "h2o")
     empty.annotation.mkdir(parents=True)
@@ -294,12 +294,12 @@ def test_a_dataset_without_clips_passes_its_reason_on(folder):
     assert json.loads((empty.splits / "empty.json").read_text()) == {"reason": "h2o is not present"}
 
 
-def test_whatever_opens_the_annotated_store_depends_on_its_split(pytestconfig):
+def test_all_stages_that_open_the_annotated_store_depend_on_its_split(pytestconfig):
     graph = read_graph(pytestconfig.rootpath)
-    made = producers(graph)
+    producer_of = producers(graph)
     for name in ("h2o", "grab", "arctic", "manipnet"):
         out = f"data/embedded/{name}/splits"
-        assert made[out].name == f"split@embedded-{name}"
+        assert producer_of[out].name == f"split@embedded-{name}"
         readers = {stage.name.rpartition(":")[2].split("@")[0] for stage in graph.values() if out in stage.deps}
         assert readers == {"train", "train-diffusion", "train-refiner", "sample", "evaluate", "evaluator", "controls"}
 

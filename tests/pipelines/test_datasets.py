@@ -1,4 +1,4 @@
-"""A dataset is a folder and a word: the stages run with one from outside the repository, and DVC with TACO."""
+"""A new dataset is a folder and a name: stages run with one from outside of the repository, and DVC with TACO."""
 
 import difflib
 import json
@@ -23,7 +23,7 @@ TYPED_FILES = ("hoidata.toml", "params.yaml")
 
 @pytest.fixture
 def here(project: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A project without manifests of the dataset; the current folder."""
+    """A project without manifests of the dataset, as the current folder."""
     monkeypatch.chdir(project)
     return project
 
@@ -45,7 +45,7 @@ def hoidata(*words: str) -> str:
 
 
 def split_of(paths: StagePaths) -> dict[str, int]:
-    """How many clips each part has."""
+    """The number of clips of each subset."""
     chosen = json.loads((paths.splits / "info.json").read_text())["chosen"]
     assert chosen["name"] == "drawn"
     assert chosen["keeps_its_promises"]
@@ -80,7 +80,7 @@ def test_a_dataset_from_a_folder_outside_the_repository_takes_three_lines(here: 
 
 
 @pytest.mark.long
-def test_taco_goes_through_dvc_repro_by_its_word(here: Path, tmp_path: Path, project_tools) -> None:
+def test_taco_runs_in_dvc_repro_after_adding_its_name(here: Path, tmp_path: Path, project_tools) -> None:
     mano, root = tmp_path / "mano", taco.write_taco(tmp_path / "taco")
     mano.mkdir()
     for side in SIDES:
@@ -95,7 +95,7 @@ def test_taco_goes_through_dvc_repro_by_its_word(here: Path, tmp_path: Path, pro
     assert split_of(StagePaths("own", "taco")) == {"train": 1, "validation": 1, "test": 1, "left_out": 0}
 
 
-def test_a_scan_keeps_what_else_stands_in_the_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scan_keeps_the_other_sections_of_hoidata_toml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("hoidata.toml").write_text('[roots]\nold = "/a"\n\n[datasets]\npaths = ["../kitchen"]\n')
     remember_root("new", Path("/b"))

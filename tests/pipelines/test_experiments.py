@@ -1,4 +1,4 @@
-"""DVC experiments, in the project folder or in a temporary copy, use the chosen profile and the files of the user."""
+"""DVC experiments, in the project folder or a temporary copy, use the chosen profile and the user's files."""
 
 import json
 from collections.abc import Callable
@@ -12,14 +12,14 @@ from hoidata.dataset_folders import outside_folders
 from hoidata.errors import MissingResource
 from hoidata.machine_folder import machine_folder
 from pipelines.stages.adapters import ensure_manifests, manifest_of
-from pipelines.stages.base import StagePaths, own_root, raw_root
+from pipelines.stages.base import StagePaths, raw_root, registered_root
 
 CLIPS, TARGET = "data/own/h2o/clips", "convert@own-h2o"
 
 
 @pytest.fixture
 def scanned(project: Path, small_corpus, project_tools) -> Path:
-    """A project with a scanned dataset, converted; dvc.lock is committed, profile and manifests are not."""
+    """A project with a scanned and converted dataset; dvc.lock is committed, profile and manifests are not."""
     root = small_corpus("h2o").raw
     params = yaml.safe_load((project / "params.yaml").read_text())
     params["convert"]["adapters"]["h2o"] = {"hands": "keypoints"}  # which need no MANO files
@@ -49,7 +49,7 @@ def of_experiment(project: Path, name: str, file: str, tools: SimpleNamespace) -
 
 
 def listed_files(project: Path, lock: dict) -> set[str]:
-    """The files of the clips that a dvc.lock names."""
+    """The files of the clips in a dvc.lock."""
     digest = next(out["md5"] for out in lock["stages"][TARGET]["outs"] if out["path"] == CLIPS)
     listing = json.loads((project / ".dvc/cache/files/md5" / digest[:2] / digest[2:]).read_text())
     return {item["relpath"] for item in listing}
@@ -73,7 +73,7 @@ def test_experiments_in_temporary_copies_use_the_users_files_of_the_chosen_profi
 
 @pytest.fixture
 def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage_folder: Callable[..., dict]) -> Path:
-    """A project, and as the current folder a temporary copy without what git does not carry, as DVC makes it."""
+    """A project, and as the current folder a temporary copy without untracked files, as DVC makes it."""
     project, copy = tmp_path / "original", tmp_path / "original/.dvc/tmp/exps/tmp1"
     (copy / "manifests").mkdir(parents=True)
     (copy / "params.yaml").write_bytes(Path("params.yaml").read_bytes())
@@ -84,19 +84,19 @@ def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage_folder: Callab
     return project
 
 
-def test_a_temporary_copy_finds_folders_that_only_this_machine_has(copied):
+def test_a_temporary_copy_finds_the_registered_folders_of_this_machine(copied):
     (copied / "hoidata.toml").write_text(
         '[roots]\nmanipnet = "/data/m"\nhand = "/data/h"\n[datasets]\npaths = ["kitchen"]\n'
     )
     (copied / "kitchen").mkdir()
     (copied / "kitchen/adapter.py").touch()
     (copied / ".hoidata/raw/embedded/grab").mkdir(parents=True)
-    assert (own_root("manipnet"), own_root("hand")) == (Path("/data/m"), Path("/data/h"))
+    assert (registered_root("manipnet"), registered_root("hand")) == (Path("/data/m"), Path("/data/h"))
     assert raw_root(StagePaths("embedded", "grab")).samefile(copied / ".hoidata/raw/embedded/grab")
     assert outside_folders()["kitchen"].samefile(copied / "kitchen")
 
 
-def test_a_temporary_copy_takes_manifests_git_does_not_know_and_calls_no_scanned_dataset_absent(copied, tmp_path):
+def test_a_temporary_copy_reads_uncommitted_manifests_of_scanned_datasets(copied, tmp_path):
     from dataclasses import replace
 
     from pipelines.lineage.manifests import ABSENT_HAND, read_manifest, write_manifest
@@ -109,7 +109,7 @@ def test_a_temporary_copy_takes_manifests_git_does_not_know_and_calls_no_scanned
     assert present == {"grab": True, "manipnet": True, "hand": True, "h2o": False}
 
 
-def test_another_project_that_runs_inside_of_a_dvc_stage_is_not_taken_for_an_experiment(tmp_path, monkeypatch):
+def test_another_project_that_runs_in_a_dvc_stage_does_not_count_as_an_experiment(tmp_path, monkeypatch):
     (tmp_path / "theirs/ours").mkdir(parents=True)
     (tmp_path / "theirs/hoidata.toml").write_text('[roots]\ngrab = "/theirs"\n')
     monkeypatch.chdir(tmp_path / "theirs/ours")

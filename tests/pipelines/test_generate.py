@@ -1,4 +1,4 @@
-"""What ``hoidata generate`` refuses before it generates, which models it takes, and what it says of a missing hinge."""
+"""``hoidata generate``: refused input, the choice of models, and the note on a missing hinge."""
 
 from collections.abc import Callable
 
@@ -12,32 +12,39 @@ from hoidata.objects.user_mesh import read_user_object
 from models.common.vocabulary import Vocabulary
 from models.text2hoi.sampler import SamplingConfig
 from pipelines.cli import app
-from pipelines.generation import Asked, Models, _clips_with, _no_hinge, _of_project, chosen_model
+from pipelines.generation import (
+    GenerationRequest,
+    Models,
+    _clips_with,
+    _missing_hinge_notes,
+    _project_models,
+    chosen_model,
+)
 from pipelines.stages.base import StagePaths
 from tests.pipelines.conftest import PROJECT
 
 
 @pytest.mark.parametrize("length", ["nan", "inf", "-inf", "1e308"])
-def test_a_length_that_is_no_number_of_seconds(length: str, tmp_path) -> None:
+def test_a_length_that_is_not_a_number_of_seconds_is_refused(length: str, tmp_path) -> None:
     words = ["generate", "Lift a box.", "--object", "box", "--out", str(tmp_path / "out"), f"--length={length}"]
-    found = CliRunner().invoke(app, words)
-    assert isinstance(found.exception, BadInput)
-    assert "--length: expected seconds" in str(found.exception)
+    result = CliRunner().invoke(app, words)
+    assert isinstance(result.exception, BadInput)
+    assert "--length: expected seconds" in str(result.exception)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("option", ["--seed=100000000000000000000", "--seed=-1", "--out={file}"])
-def test_a_seed_no_array_holds_and_a_file_in_the_place_of_the_folder(option: str, tmp_path) -> None:
+def test_a_seed_out_of_range_and_a_file_as_output_folder_are_refused(option: str, tmp_path) -> None:
     file = tmp_path / "out"
     file.write_text("mine")
     words = ["generate", "Lift a box.", "--object", "box", "--out", str(tmp_path / "new"), option.format(file=file)]
-    found = CliRunner().invoke(app, words)
-    assert found.exit_code == 2
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 2
     assert file.read_text() == "mine"
     assert not (tmp_path / "new").exists()
 
 
-IDLE = [
+INEFFECTIVE = [
     (["--unit=cm"], "--unit"),
     (["--up=y", "--hinge=0,0,0 0,0,1"], "--up, --hinge"),
     (["--encoder=use"], "--encoder"),
@@ -47,12 +54,12 @@ IDLE = [
 ]
 
 
-@pytest.mark.parametrize(("options", "named"), IDLE)
-def test_an_option_that_would_change_nothing_is_refused(options, named, tmp_path) -> None:
+@pytest.mark.parametrize(("options", "named"), INEFFECTIVE)
+def test_an_option_without_effect_is_refused(options, named, tmp_path) -> None:
     words = ["generate", "Lift a box.", "--object", "box", "--out", str(tmp_path / "out")]
-    found = CliRunner().invoke(app, [*words, *(option.format(folder=tmp_path) for option in options)])
-    assert isinstance(found.exception, BadInput)
-    assert str(found.exception).startswith(f"{named}: expected")
+    result = CliRunner().invoke(app, [*words, *(option.format(folder=tmp_path) for option in options)])
+    assert isinstance(result.exception, BadInput)
+    assert str(result.exception).startswith(f"{named}: expected")
 
 
 LONG = "b" * 300
@@ -67,24 +74,24 @@ LONG = "b" * 300
     ],
     ids=["generate", "animate", "hands"],
 )
-def test_a_name_longer_than_a_file_may_have(words, tmp_path) -> None:
-    found = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")])
-    assert isinstance(found.exception, BadInput | MissingResource), found.output
+def test_a_name_longer_than_a_file_name_may_be_is_refused(words, tmp_path) -> None:
+    result = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")])
+    assert isinstance(result.exception, BadInput | MissingResource), result.output
 
 
-def test_a_dataset_without_models_is_told_with_those_that_have_them(monkeypatch) -> None:
+def test_a_dataset_without_models_is_refused_with_a_list_of_those_that_have_them(monkeypatch) -> None:
     monkeypatch.setattr(
         "pipelines.generation.why_not_trained", lambda paths: None if paths.dataset == "grab" else "not there"
     )
-    with pytest.raises(MissingResource, match=r"embedded-nope: not there; models are there of grab$"):
-        chosen_model(Asked("Lift a box.", "box", "embedded", ("h2o", "grab"), model="nope"), "lift", "box")
+    with pytest.raises(MissingResource, match=r"embedded-nope: not there; these datasets have models: grab$"):
+        chosen_model(GenerationRequest("Lift a box.", "box", "embedded", ("h2o", "grab"), model="nope"), "lift", "box")
     with pytest.raises(MissingResource, match=r"embedded-h2o: not there$"):
-        chosen_model(Asked("Lift a box.", "box", "embedded", ("h2o",)), "lift", "box")
+        chosen_model(GenerationRequest("Lift a box.", "box", "embedded", ("h2o",)), "lift", "box")
 
 
 @pytest.fixture
 def three_datasets(monkeypatch) -> tuple[str, ...]:
-    """Three trained datasets, by their clips of verb and noun, and by the objects they have."""
+    """Three trained datasets with their vocabularies and the names of their objects."""
     counts = {
         "h2o": {("take out", "bottle", "left"): 9, ("open", "milk", "left"): 2},
         "grab": {("pour", "mug", "left"): 2, ("lift", "box", "right"): 1},
@@ -98,7 +105,7 @@ def three_datasets(monkeypatch) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize(
-    ("verb", "thing", "name", "dataset"),
+    ("verb", "noun", "name", "dataset"),
     [
         ("pour", "bottle", "file.stl", "arctic"),  # no dataset pours from a bottle, and arctic pours most
         ("pour", "mug", "file.stl", "grab"),
@@ -113,53 +120,61 @@ def three_datasets(monkeypatch) -> tuple[str, ...]:
     ],
 )
 def test_the_verb_chooses_the_models_then_the_named_object_then_the_noun(
-    verb: str | None, thing: str | None, name: str, dataset: str, three_datasets
+    verb: str | None, noun: str | None, name: str, dataset: str, three_datasets
 ) -> None:
-    asked = Asked("", name, "embedded", three_datasets)
-    paths, why = chosen_model(asked, verb, thing)
+    request = GenerationRequest("", name, "embedded", three_datasets)
+    paths, reason = chosen_model(request, verb, noun)
     assert paths.dataset == dataset
-    assert ("clips of" in why) == (verb in ("pour", "open", "take out"))
+    assert ("clips of" in reason) == (verb in ("pour", "open", "take out"))
     holder = next(
-        (run for run in three_datasets if name in {"h2o": ("bottle", "milk"), "grab": ("mug",)}.get(run, ())), ""
+        (
+            dataset_name
+            for dataset_name in three_datasets
+            if name in {"h2o": ("bottle", "milk"), "grab": ("mug",)}.get(dataset_name, ())
+        ),
+        "",
     )
     expected = StagePaths("embedded", holder or ("arctic" if name == "kettle" else dataset))
-    assert _clips_with(asked, paths) == expected.clips
+    assert _clips_with(request, paths) == expected.clips
 
 
 @pytest.fixture
 def models_of(tmp_path, monkeypatch) -> Callable[..., Models]:
-    """What a project with such a params.yaml generates with; its hands and encoder are their names."""
+    """The models that a project with a given params.yaml uses; hands and encoder are replaced by their names."""
 
-    def found(profile: str, values: dict) -> Models:
+    def load(profile: str, values: dict) -> Models:
         (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
         monkeypatch.setattr("pipelines.generation.chosen_model", lambda *_: (StagePaths(profile, "grab"), ""))
-        return _of_project(Asked("Lift a box.", "box", profile=profile), "lift", "box")[0]
+        return _project_models(GenerationRequest("Lift a box.", "box", profile=profile), "lift", "box")[0]
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("pipelines.generation.load_hands", lambda profile: profile)
     monkeypatch.setattr("pipelines.generation.load_encoder", lambda name: name)
-    return found
+    return load
 
 
 PARAMS = yaml.safe_load((PROJECT / "params.yaml").read_text())
 
 
-def test_encoder_points_and_sampling_are_those_of_the_profile_that_is_asked_for(models_of) -> None:
-    """But for half precision, which is slow on a CPU."""
-    own = {
+def test_encoder_points_and_sampling_are_those_of_the_requested_profile(models_of) -> None:
+    """Except half precision, which is slow on a CPU."""
+    overlay = {
         "annotate": {"encoder": "hash"},
         "contact": {"points": 512},
         "sample": {"text2hoi": {"max_attempts": 1, "precision": "float16"}},
     }
-    values = {**PARAMS, "profile": "embedded", "profiles": {"own": own}}
-    found = [models_of(profile, values) for profile in ("embedded", "own")]
-    assert [(one.hands, one.encoder, one.points) for one in found] == [("embedded", "use", 1024), ("own", "hash", 512)]
-    assert [one.sampling.max_attempts for one in found] == [5, 1]
-    assert {one.sampling.precision for one in found} == {"float32"}
+    values = {**PARAMS, "profile": "embedded", "profiles": {"own": overlay}}
+    models = [models_of(profile, values) for profile in ("embedded", "own")]
+    assert [(entry.hands, entry.encoder, entry.points) for entry in models] == [
+        ("embedded", "use", 1024),
+        ("own", "hash", 512),
+    ]
+    assert [entry.sampling.max_attempts for entry in models] == [5, 1]
+    assert {entry.sampling.precision for entry in models} == {"float32"}
 
 
 @pytest.mark.parametrize("sample", [{"sample": None}, {}])
-def test_a_section_sample_that_says_nothing(sample, models_of) -> None:
+def test_an_empty_section_sample_gives_the_defaults(sample, models_of) -> None:
     values = {name: value for name, value in PARAMS.items() if name not in ("sample", "profiles")}
     assert models_of("embedded", values | sample).sampling == SamplingConfig()
 
@@ -169,7 +184,7 @@ HINGE = "0,0.05,0.021 -1,0,0"
 
 @pytest.fixture
 def box(tmp_path):
-    """A box and its lid, which has a knob: three shells, two named nodes."""
+    """The path of a mesh of a box and its lid with a knob: three shells, two named nodes."""
     bottom, lid = trimesh.creation.box((0.1, 0.1, 0.04)), trimesh.creation.box((0.1, 0.1, 0.01))
     knob = trimesh.creation.icosphere(1, 0.01).apply_translation([0, 0, 0.06])
     lid = trimesh.util.concatenate([lid.apply_translation([0, 0, 0.03]), knob])
@@ -179,11 +194,11 @@ def box(tmp_path):
 
 
 def notes(verb, path, hinge=""):
-    return _no_hinge(verb, path, read_user_object(path, up="z", hinge=hinge).model)
+    return _missing_hinge_notes(verb, path, read_user_object(path, up="z", hinge=hinge).model)
 
 
 @pytest.mark.parametrize("verb", ["open", "close"])
-def test_a_mesh_of_two_pieces_without_a_hinge_says_so_and_names_the_option(box, verb):
+def test_the_note_on_a_mesh_of_two_pieces_without_a_hinge_names_the_option(box, verb):
     (note,) = notes(verb, box)
     assert note.startswith(
         f"{verb!r} turns a hinge, but the object has none: the mesh has two pieces ('bottom' and 'lid')"
@@ -203,10 +218,10 @@ def test_a_mesh_of_one_piece_needs_another_mesh(tmp_path):
 
 
 def test_a_rigid_object_of_a_dataset_needs_another_object(box):
-    assert _no_hinge("open", "box", read_user_object(box, up="z").model)[0].endswith("choose one that has")
+    assert _missing_hinge_notes("open", "box", read_user_object(box, up="z").model)[0].endswith("choose one that has")
 
 
-def test_nothing_is_said_of_a_mesh_with_its_hinge_or_of_a_verb_that_turns_none(box):
+def test_a_mesh_with_a_hinge_and_a_verb_that_turns_none_give_no_note(box):
     assert not notes("open", box, HINGE)
     assert not notes("lift", box)
     assert not notes(None, box)

@@ -1,4 +1,4 @@
-"""The graph as DVC resolves it: what it depends on is there, and the code it names is what runs."""
+"""The graph as DVC resolves it: all dependencies exist, and the recorded code is the code that runs."""
 
 import ast
 import json
@@ -17,14 +17,14 @@ from pipelines.stages.code import code_today
 from pipelines.stages.families import OPTIONAL_FAMILIES
 
 PROJECT = Path(__file__).parents[2]
-# What a module that imports others by name calls; what it picks must be told in pipelines/stages/code.py.
+# Calls of a module that imports dynamically; its choice must be in pipelines/stages/code.py.
 IMPORTERS = {"import_module", "__import__", "spec_from_file_location"}
 NEVER_OF_A_STAGE = (
     "hoidata/conformance/",
     "hoidata/store_check/",
     "pipelines/lineage/tree.py",
 )
-# Prints the files of our packages that a stage's module and everything it reaches have loaded.
+# Prints the files of the project's packages that a stage's module loads.
 LOADED = """
 import json, sys
 from importlib import import_module
@@ -45,15 +45,15 @@ def code() -> dict[str, dict[str, str]]:
     return code_today(PROJECT)
 
 
-def test_every_dependency_is_made_by_a_stage_or_committed(graph, code):
-    made = {out for stage in graph.values() for out in stage.outs}
-    parents = {parent.as_posix() for out in made for parent in Path(out).parents}
+def test_all_dependencies_are_committed_or_outputs_of_stages(graph, code):
+    outputs = {out for stage in graph.values() for out in stage.outs}
+    parents = {parent.as_posix() for out in outputs for parent in Path(out).parents}
     for stage in graph.values():
         assert [path for path in stage.code if path not in code] == []
-        assert [path for path in stage.data if path not in made | parents and not (PROJECT / path).exists()] == []
+        assert [path for path in stage.data if path not in outputs | parents and not (PROJECT / path).exists()] == []
 
 
-def test_every_stage_depends_on_the_code_of_its_own_module(graph, code):
+def test_all_stages_depend_on_the_code_of_their_module(graph, code):
     for stage in graph.values():
         if stage.outs != ("code",):
             assert stage.code
@@ -61,13 +61,13 @@ def test_every_stage_depends_on_the_code_of_its_own_module(graph, code):
                 assert f"pipelines/stages/{file.split('/')[1].removesuffix('.json')}.py" in code[file]
 
 
-def test_no_module_of_a_stage_imports_by_name_but_the_one_the_closures_are_told_of(code):
-    found = set()
+def test_only_modules_with_a_choice_import_dynamically(code):
+    modules = set()
     for file in {file for digests in code.values() for file in digests if file.endswith(".py")}:
         nodes = ast.walk(ast.parse((PROJECT / file).read_bytes()))
         if {getattr(node, "attr", getattr(node, "id", "")) for node in nodes} & IMPORTERS:
-            found.add(file)
-    assert found == {"hoidata/datasets/registry.py"}
+            modules.add(file)
+    assert modules == {"hoidata/datasets/registry.py"}
 
 
 @pytest.mark.slow
@@ -80,29 +80,29 @@ def test_importing_a_closure_loads_no_file_outside_of_it(code, name):
     loaded = {Path(path) for path in json.loads(result.stdout)}
     ours = {path.relative_to(PROJECT).as_posix() for path in loaded if path.is_relative_to(PROJECT)}
     ours = {path for path in ours if path.split("/")[0] in ("hoidata", "models", "pipelines")}
-    assert ours - {"models/registry.py"} == set(files)  # a table: what it picks counts, it does not
+    assert ours - {"models/registry.py"} == set(files)  # a registry: its selection counts, its text does not
 
 
-def test_rooms_that_change_no_result_are_in_no_stage(code):
+def test_packages_that_change_no_result_are_in_no_stage(code):
     files = {file for digests in code.values() for file in digests}
     assert [file for file in files if file.startswith(NEVER_OF_A_STAGE)] == []
 
 
-def test_a_dataset_without_settings_of_its_own_needs_no_line_in_the_params(tmp_path):
+def test_a_dataset_without_settings_needs_no_line_in_params(tmp_path):
     (tmp_path / "params.yaml").write_text("{datasets: [taco], families: [], train: {demo: {}}}")
     assert code_today(tmp_path)["code/convert/taco.json"]["params.yaml convert.adapters.taco"] == "null"
 
 
-def test_every_dataset_of_the_params_has_an_adapter():
+def test_all_datasets_in_params_have_an_adapter():
     assert set(read_params(PROJECT)["datasets"]) <= set(adapter_names())
 
 
-def test_every_section_of_the_params_belongs_to_a_stage():
+def test_all_sections_of_params_belong_to_a_stage():
     sections = {name for name, value in read_params(PROJECT).items() if isinstance(value, dict)}
-    assert sections <= {*STAGES, "family_datasets"}  # dvc.yaml reads the latter
+    assert sections <= {*STAGES, "family_datasets"}  # the templates of dvc.yaml use the latter
 
 
-def test_every_stage_names_its_own_profile_so_that_profiles_never_share_outputs(graph):
+def test_all_stages_have_the_profile_in_their_outputs(graph):
     for stage in graph.values():
         assert all("embedded" in out.split("/") for out in stage.outs if out != "code")
 
@@ -126,19 +126,19 @@ def test_a_family_that_is_off_has_no_stage_and_one_dataset_turns_it_on(graph, pr
     assert added == sampled | trained | {"samples/embedded/arctic/controls-bimart"}
 
 
-def test_deployments_are_the_graphs_own_work_by_dataset_and_family(graph):
+def test_deployments_are_the_stages_of_the_graph_by_dataset_and_family(graph):
     from pipelines.flows import deployment_targets
 
     params = read_params(PROJECT)
-    found = deployment_targets(graph, params["profile"], params["datasets"])
-    assert found["full-graph"] == []
-    assert found["annotate-arctic"] == ["annotate@{profile}-arctic"]
-    assert found["evaluate-h2o"] == ["evaluate@{profile}-h2o"]
+    targets = deployment_targets(graph, params["profile"], params["datasets"])
+    assert targets["full-graph"] == []
+    assert targets["annotate-arctic"] == ["annotate@{profile}-arctic"]
+    assert targets["evaluate-h2o"] == ["evaluate@{profile}-h2o"]
     at = "models/text2hoi/dvc.yaml:train"
     networks = [f"{at}@{{profile}}-grab-contact", f"{at}@{{profile}}-grab-length"]
-    assert sorted(found["train-grab-text2hoi"]) == sorted(
+    assert sorted(targets["train-grab-text2hoi"]) == sorted(
         [*networks, f"{at}-diffusion@{{profile}}-grab", f"{at}-refiner@{{profile}}-grab"]
     )
-    assert {target.replace("{profile}", params["profile"]) for targets in found.values() for target in targets} <= set(
-        graph
-    )
+    assert {
+        target.replace("{profile}", params["profile"]) for targets in targets.values() for target in targets
+    } <= set(graph)

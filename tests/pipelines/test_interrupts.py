@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM at any moment: a command ends within ten seconds, with all it started, and says so in words."""
+"""Ctrl-C and SIGTERM at any moment end a command and its processes within ten seconds, with a message."""
 
 import contextlib
 import os
@@ -15,7 +15,7 @@ import pytest
 
 from tests.pipelines.test_side_by_side import PROJECT, tiny_project
 
-MARK = "HOIDATA_TEST_RUN"  # a variable that all processes of a run inherit
+MARK = "HOIDATA_TEST_RUN"  # an environment variable that all processes of a run inherit
 MOMENTS = range(2 * int(os.environ.get("HOIDATA_CHAOS", "1")))
 STUBBORN = """
 import signal, sys, time
@@ -24,7 +24,7 @@ for number in (signal.SIGINT, signal.SIGTERM):
 print("stubborn", flush=True)
 time.sleep(60)
 """
-# `hoidata repro` without the look at raw files, which a project of other stages has none of.
+# `hoidata repro` without the check of raw files, for a project with other stages.
 REPRO = """
 from hoidata.lifetime import run_interruptibly
 def main():
@@ -36,13 +36,13 @@ if __name__ == "__main__":
 
 
 def processes_of(mark: str) -> list[psutil.Process]:
-    """All processes that inherited the mark, whoever their parent is by now."""
-    found = []
+    """All processes that inherited the mark, whatever their parent is now."""
+    processes = []
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):
             if process.environ().get(MARK) == mark:
-                found.append(process)
-    return [process for process in found if is_at_work(process)]
+                processes.append(process)
+    return [process for process in processes if is_at_work(process)]
 
 
 def is_at_work(process: psutil.Process) -> bool:
@@ -59,7 +59,7 @@ def until(holds: Callable[[], object], seconds: float) -> None:
 
 
 class Run:
-    """A command under a mark of its own; its output goes to a file."""
+    """A command with a unique mark in its environment; its output goes to a file."""
 
     def __init__(self, words: list[str], folder: Path, environment: dict[str, str], **options) -> None:
         self.mark = f"{folder}-{time.monotonic_ns()}"
@@ -70,7 +70,7 @@ class Run:
             )
 
     def until_it_handles_signals(self) -> None:
-        """SIGTERM is caught only after our code has begun: before, the interpreter itself is starting."""
+        """Wait until the command handles SIGTERM, which it does not while the interpreter starts."""
 
         def is_handled() -> bool:
             [caught] = [line for line in self.status().splitlines() if line.startswith("SigCgt")]
@@ -82,7 +82,7 @@ class Run:
         return Path(f"/proc/{self.process.pid}/status").read_text()
 
     def ends(self, seconds: float = 10) -> int:
-        """The exit code, when the command and all it started have ended in time."""
+        """Wait until the command and its processes have ended in time, and return the exit code."""
         start = time.monotonic()
         code = self.process.wait(seconds)
         until(lambda: not processes_of(self.mark), max(1, start + seconds - time.monotonic()))
@@ -91,7 +91,7 @@ class Run:
 
 @pytest.fixture
 def stubborn_project(tmp_path: Path) -> Path:
-    """Its first stage ignores Ctrl-C and SIGTERM."""
+    """A project whose first stage ignores Ctrl-C and SIGTERM."""
     tiny_project(tmp_path)
     (tmp_path / "make.py").write_text(STUBBORN)
     (tmp_path / "repro.py").write_text(REPRO)
@@ -107,7 +107,7 @@ def stubborn_run(folder: Path, **options) -> Run:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
-def test_a_run_kills_a_stage_that_ignores_its_end(stubborn_project, sent):
+def test_a_run_kills_a_stage_that_ignores_signals(stubborn_project, sent):
     run = stubborn_run(stubborn_project)
     run.process.send_signal(sent)
     assert run.ends() == 128 + sent
@@ -116,7 +116,7 @@ def test_a_run_kills_a_stage_that_ignores_its_end(stubborn_project, sent):
 
 
 @pytest.mark.slow
-def test_a_second_ctrl_c_hastens_the_end_of_a_run(stubborn_project):
+def test_a_second_ctrl_c_ends_a_run_at_once(stubborn_project):
     run = stubborn_run(stubborn_project)
     start = time.monotonic()
     run.process.send_signal(signal.SIGINT)
@@ -128,8 +128,8 @@ def test_a_second_ctrl_c_hastens_the_end_of_a_run(stubborn_project):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGKILL])
-def test_a_run_in_the_background_of_a_script_takes_its_stages_along(stubborn_project, sent):
-    """There Ctrl-C is ignored by everything that the script starts with `&`."""
+def test_the_stages_of_a_run_in_the_background_of_a_script_end_with_it(stubborn_project, sent):
+    """Commands that a script starts with `&` ignore Ctrl-C."""
     run = stubborn_run(stubborn_project, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN))
     run.process.send_signal(sent)
     assert run.ends() == (143 if sent == signal.SIGTERM else -sent)
@@ -153,7 +153,7 @@ subprocess.run(sys.argv[1:])
 @pytest.mark.parametrize("shell", ["dash", "bash"])
 @pytest.mark.parametrize("killed", ["DVC", "its shell"])
 def test_a_stage_ends_with_the_dvc_that_runs_it(tmp_path, shell, killed):
-    """Some shells put the command in their own place, and others stay between the two."""
+    """Some shells replace themselves with the command, others stay its parent."""
     (tmp_path / "stage.py").write_text(STAGE)
     command = [sys.executable, "-c", DVC, shell, "-c", f"{sys.executable} {tmp_path / 'stage.py'} raw --dataset grab"]
     environment = {**os.environ, "DVC_STAGE": "raw@embedded-grab", "PYTHONPATH": str(PROJECT)}
@@ -169,18 +169,18 @@ def test_a_stage_ends_with_the_dvc_that_runs_it(tmp_path, shell, killed):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("turn", MOMENTS)
+@pytest.mark.parametrize("moment", MOMENTS)
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("words", [("hoidata", "repro"), ("hoidata", "synth", "write", "grab")], ids=" ".join)
-def test_a_signal_at_any_moment_of_its_start_ends_a_command(project, project_tools, words, sent, turn):
-    """Ctrl-C reaches all processes of a command in a terminal, SIGTERM the one that it is sent to."""
+def test_a_signal_at_any_moment_of_its_start_ends_a_command(project, project_tools, words, sent, moment):
+    """Ctrl-C reaches all processes of a command in a terminal, SIGTERM only one."""
     run = Run(list(words), project, project_tools.environment(), start_new_session=True)
     run.until_it_handles_signals()
-    time.sleep(random.Random(f"{words} {sent} {turn}").uniform(0, 12))
+    time.sleep(random.Random(f"{words} {sent} {moment}").uniform(0, 12))
     if sent == signal.SIGINT:
         os.killpg(run.process.pid, sent)
     else:
         run.process.send_signal(sent)
     code = run.ends()
-    told = run.log.read_text()
-    assert (code, told.count("run it again"), "Traceback" in told) == (128 + sent, 1, False), told
+    output = run.log.read_text()
+    assert (code, output.count("run it again"), "Traceback" in output) == (128 + sent, 1, False), output

@@ -1,4 +1,4 @@
-"""Text of foreign files is text in tables and terminals, never markup."""
+"""Text from untrusted files is plain text in tables and terminals, never markup."""
 
 import pytest
 from markdown_it import MarkdownIt

@@ -1,4 +1,4 @@
-"""An error about something that is missing names the setting of the adapter that does without it."""
+"""An error about a missing file names the adapter's setting that makes it unnecessary."""
 
 import shutil
 from pathlib import Path
@@ -31,7 +31,7 @@ def hoi4d_without_events(root: Path) -> Path:
 
 
 @pytest.mark.parametrize(("name", "write"), [("arctic", arctic_without_descriptions), ("hoi4d", hoi4d_without_events)])
-def test_a_scan_that_lacks_a_part_names_the_setting_that_does_without(name: str, write, tmp_path: Path) -> None:
+def test_a_scan_that_lacks_a_part_names_the_setting_that_makes_it_unnecessary(name: str, write, tmp_path: Path) -> None:
     root = write(tmp_path / "raw")
     with pytest.raises(BadInput) as caught:
         _require_parts(get_adapter(name), root)
@@ -51,14 +51,14 @@ def test_a_conversion_that_lacks_events_or_descriptions_names_the_setting_too(tm
 
 
 @pytest.mark.parametrize(("name", "setting"), [("h2o", "hands=keypoints"), ("hot3d", "hands=umetrack")])
-def test_missing_mano_files_are_told_with_the_setting_that_needs_none(
+def test_the_error_about_missing_mano_files_names_the_setting_that_needs_none(
     name: str, setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HOIDATA_MANO", raising=False)
     result = CliRunner().invoke(app, ["convert", name, "--root", str(tmp_path), "--out", str(tmp_path / "store")])
     assert isinstance(result.exception, MissingResource)
-    assert str(result.exception).endswith(f", or give --setting {setting}")
+    assert str(result.exception).endswith(f", or use --setting {setting}")
     key, _, value = setting.partition("=")
     (tmp_path / "params.yaml").write_text("profile: own\n")
     with pytest.raises(MissingResource, match="no MANO files are registered") as caught:

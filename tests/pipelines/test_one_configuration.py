@@ -1,4 +1,4 @@
-"""One threshold, one copy of each default: what the contact stage is told reaches labels, masks, losses and pages."""
+"""The settings of the contact stage reach labels, masks, losses and pages; each default is defined once."""
 
 import ast
 import json
@@ -30,9 +30,9 @@ PATHS = StagePaths("embedded", "grab")
 THRESHOLD_M = {"wide": 0.02, "narrow": 0.01}
 SHIFT_M = np.float32([0.006, 0.004, 0.004])
 RULE = {"by": "subject", "train": "rest", "validation": ["s9"], "test": ["s10"]}
-# Named for the user although the library's default is the same: readers look for it here.
+# In params.yaml although it equals the default, because users look for it there.
 SHOWN_ON_PURPOSE = {"annotate.encoder"}
-# Constants that are as large as a contact threshold and mean something else.
+# Constants with the value of the contact threshold and another meaning.
 OTHER_LENGTHS = {
     "LONGEST_EDGE_M", "STAND_RADIUS_M", "LARGEST_DISTANCE_M", "REACH_M", "HANDS_BELOW", "TOUCH_M",
     "GUIDED_WITHIN_M", "FADES_M", "DEEP_M", "FLOATING_M",
@@ -40,7 +40,7 @@ OTHER_LENGTHS = {
 
 
 def annotated_at(folder: Path, threshold_m: float, make_clip, monkeypatch) -> AnnotatedStore:
-    """Three clips through the stages with ``contact.threshold_m`` set and nothing else said."""
+    """Three clips after all data stages, with only ``contact.threshold_m`` set."""
     folder.mkdir()
     shutil.copytree(PROJECT / "manifests" / "embedded", folder / "manifests" / "embedded")
     params = {"contact": {"threshold_m": threshold_m, "points": 256}, "annotate": {"encoder": "hash"}}
@@ -63,7 +63,7 @@ def wide_and_narrow(tmp_path, make_clip, monkeypatch) -> tuple[AnnotatedStore, A
     return wide, narrow
 
 
-def test_the_contact_threshold_changes_labels_hand_types_masks_and_words_alike(wide_and_narrow):
+def test_the_contact_threshold_changes_labels_hand_types_masks_and_sentences(wide_and_narrow):
     wide, narrow = wide_and_narrow
     key = wide.ids("train")[0]
     assert 0 < narrow.contact(key).sum() < wide.contact(key).sum()
@@ -76,45 +76,46 @@ def test_the_contact_threshold_changes_labels_hand_types_masks_and_words_alike(w
     assert samples[1].contact_map.sum() < samples[0].contact_map.sum()
 
 
-def test_the_losses_of_a_batch_use_the_threshold_it_was_made_with(wide_and_narrow):
+def test_the_losses_of_a_batch_use_the_threshold_of_its_data(wide_and_narrow):
     batches = [collate(list(HoiDataset(store, "train"))) for store in wide_and_narrow]
     apart = torch.tensor([0.005, 0.015, -0.015, 0.025])
     touching = [losses.touching_joints(apart, batch.contact_threshold_m).tolist() for batch in batches]
     assert touching == [[True, True, True, False], [True, False, False, False]]
 
 
-def test_the_figures_of_evaluation_use_the_threshold_the_contact_stage_was_told(wide_and_narrow, tmp_path, monkeypatch):
-    paths, found = replace(PATHS, family="ours"), {}
+def test_metrics_use_the_threshold_of_the_contact_stage(wide_and_narrow, tmp_path, monkeypatch):
+    paths, metrics = replace(PATHS, family="ours"), {}
     for name, store in zip(("wide", "narrow"), wide_and_narrow, strict=True):
         monkeypatch.chdir(tmp_path / name)
         [key] = store.ids("test")
-        true = store.clip(key)
-        made = replace(
-            true, hands={side: replace(hand, wrist_m=hand.wrist_m + SHIFT_M) for side, hand in true.hands.items()}
+        recorded = store.clip(key)
+        predicted = replace(
+            recorded,
+            hands={side: replace(hand, wrist_m=hand.wrist_m + SHIFT_M) for side, hand in recorded.hands.items()},
         )
-        write_store(paths.samples / "clips", [made], generated_info("ours"))
+        write_store(paths.samples / "clips", [predicted], generated_info("ours"))
         (paths.samples / "diagnostics.json").write_text("{}")
         evaluate.run(paths)
-        found[name] = json.loads((paths.metrics / "ours.json").read_text())
+        metrics[name] = json.loads((paths.metrics / "ours.json").read_text())
         touched = [
             touched_points(clip, store.points(store.object_key(key)).points_m, THRESHOLD_M[name])
-            for clip in (made, true)
+            for clip in (predicted, recorded)
         ]
         f1 = 2 * (touched[0] & touched[1]).sum() / (touched[0].sum() + touched[1].sum())
-        assert found[name]["figures"]["contact_f1"] == pytest.approx(f1, abs=1e-6)
-    values = [found[name]["counts"]["contact_distance_mm"]["values"] for name in ("narrow", "wide")]
+        assert metrics[name]["figures"]["contact_f1"] == pytest.approx(f1, abs=1e-6)
+    values = [metrics[name]["counts"]["contact_distance_mm"]["values"] for name in ("narrow", "wide")]
     assert 0 < values[0] < values[1]
 
 
 def touched_points(clip, points_m: np.ndarray, threshold_m: float) -> np.ndarray:
-    """(point,) bool: of a rigid object's points, by all distances to the right hand's joints in the object's frame."""
+    """(point,) bool, points of a rigid object that the right hand touches, from all distances to its joints."""
     world = track_joints(clip.hands["right"], load_embedded_hands().right)
     turns = Rotation.from_rotvec(clip.object.rotvec).as_matrix()
     joints = np.einsum("fji,fkj->fki", turns, world - clip.object.translation_m[:, None])
     return (np.linalg.norm(joints[:, :, None] - points_m, axis=-1) < threshold_m).any(axis=(0, 1))
 
 
-def test_params_repeat_no_default_of_the_library():
+def test_params_repeat_no_defaults_of_the_library():
     params = yaml.safe_load((PROJECT / "params.yaml").read_text())
     repeated = set()
     for section in SECTIONS:
@@ -126,8 +127,8 @@ def test_params_repeat_no_default_of_the_library():
 
 
 @pytest.mark.slow
-def test_threshold_and_points_are_written_down_once_in_the_product():
-    """Of all constants and default values in the code, one states the threshold and one the number of points."""
+def test_threshold_and_number_of_points_are_defined_once():
+    """Of all constants and default values in the code, one is the threshold and one the number of points."""
     homes: dict[float, list[str]] = {0.02: [], 1024: []}
     for room in ("hoidata", "models", "pipelines"):
         for path in sorted((PROJECT / room).rglob("*.py")):
@@ -140,16 +141,16 @@ def test_threshold_and_points_are_written_down_once_in_the_product():
 
 
 def constants(tree: ast.Module) -> list[tuple[str, float]]:
-    """(name, number) of every plain assignment, annotated field and default value of an argument."""
-    found: list[tuple[ast.expr | ast.arg, ast.expr | None]] = []
+    """(name, number) of all assignments, annotated fields and default values of arguments."""
+    assignments: list[tuple[ast.expr | ast.arg, ast.expr | None]] = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Assign):
-            found += [(target, node.value) for target in node.targets]
+            assignments += [(target, node.value) for target in node.targets]
         elif isinstance(node, ast.AnnAssign):
-            found.append((node.target, node.value))
+            assignments.append((node.target, node.value))
         elif isinstance(node, ast.arguments):
             positional = [*node.posonlyargs, *node.args]
-            found += list(zip(positional[len(positional) - len(node.defaults) :], node.defaults, strict=True))
-            found += list(zip(node.kwonlyargs, node.kw_defaults, strict=True))
-    names = ((getattr(target, "id", None) or getattr(target, "arg", ""), value) for target, value in found)
+            assignments += list(zip(positional[len(positional) - len(node.defaults) :], node.defaults, strict=True))
+            assignments += list(zip(node.kwonlyargs, node.kw_defaults, strict=True))
+    names = ((getattr(target, "id", None) or getattr(target, "arg", ""), value) for target, value in assignments)
     return [(name, value.value) for name, value in names if isinstance(value, ast.Constant) and name]

@@ -1,4 +1,4 @@
-"""The profile ``own``: the user's files are registered, or refused with instructions; never synthetic ones instead."""
+"""The profile ``own``: the user's files are registered, or refused with instructions, and never replaced."""
 
 import json
 import os
@@ -30,9 +30,9 @@ def is_present(folder: Path, name: str) -> bool:
 
 
 def make_present(folder: Path, name: str) -> None:
-    """As if the dataset had been scanned."""
-    found = manifest_of(StagePaths("own", name))
-    write_manifest(folder / "manifests/own" / f"{name}.json", replace(found, present=True))
+    """Write a manifest that says that the dataset is present."""
+    manifest = manifest_of(StagePaths("own", name))
+    write_manifest(folder / "manifests/own" / f"{name}.json", replace(manifest, present=True))
 
 
 def commit(folder: Path, tools) -> None:
@@ -41,7 +41,7 @@ def commit(folder: Path, tools) -> None:
 
 
 def changed_files(folder: Path, tools) -> set[str]:
-    """What git shows as changed or new, as ``git status --short`` marks it."""
+    """Changed and new files as in ``git status --short``."""
     shown = tools.run(folder, "git", "status", "--porcelain", "--untracked-files=all").stdout
     return {line for line in shown.splitlines()}
 
@@ -70,7 +70,7 @@ def test_repro_refuses_before_dvc_starts(project, project_tools, monkeypatch):
 
 
 @pytest.mark.slow
-def test_mano_files_are_registered_by_digest_and_place(project, tmp_path, project_tools):
+def test_mano_files_are_registered_with_digest_and_folder(project, tmp_path, project_tools):
     mano = tmp_path / "mano"
     mano.mkdir()
     missing = project_tools.run(project, "hoidata", "raw", "scan", "mano", "--root", str(mano))
@@ -88,7 +88,7 @@ def test_mano_files_are_registered_by_digest_and_place(project, tmp_path, projec
 
 
 @pytest.mark.slow
-def test_git_sees_the_chosen_profile_and_the_manifests_of_a_scan_and_dvc_builds_the_users_profile(
+def test_git_shows_the_chosen_profile_and_new_manifests_and_dvc_builds_the_profile_own(
     project, small_corpus, project_tools
 ):
     make_plain_params(project)
@@ -107,7 +107,7 @@ def test_git_sees_the_chosen_profile_and_the_manifests_of_a_scan_and_dvc_builds_
     assert not json.loads((project / "data/own/h2o/raw.json").read_text())["present"]
 
 
-def test_the_chosen_profile_is_one_changed_line_of_params_as_git_sees_any_other_setting(here, project_tools):
+def test_choosing_a_profile_changes_one_line_of_params(here, project_tools):
     make_plain_params(here)
     commit(here, project_tools)
     assert hoidata("profile", "own").stdout == "own\n"
@@ -124,14 +124,14 @@ def test_the_chosen_profile_is_one_changed_line_of_params_as_git_sees_any_other_
     assert isinstance(hoidata("profile", "mine").exception, BadInput)
 
 
-def test_a_profile_that_cannot_be_set_is_told(here):
+def test_a_profile_that_cannot_be_set_is_refused(here):
     params = here / "params.yaml"
     params.write_text(params.read_text().replace("profile: embedded", '"profile": embedded'))
     assert isinstance(hoidata("profile", "own").exception, BadInput)
 
 
 def make_plain_params(folder: Path) -> None:
-    """params.yaml as delivered, comments and all."""
+    """params.yaml as delivered, including comments."""
     shutil.copy(PROJECT / "params.yaml", folder)
 
 
@@ -144,7 +144,7 @@ def test_a_folder_without_sequences_is_not_registered(project, tmp_path, project
 
 
 def hoidata(*words: str) -> Result:
-    """The command in this process and in the current folder."""
+    """Run a command in this process and the current folder."""
     return CliRunner().invoke(app, words)
 
 
@@ -157,7 +157,7 @@ def here(project, monkeypatch) -> Path:
 
 
 def set_own(folder: Path, present: str = "") -> None:
-    """Profile own, in which one dataset was scanned."""
+    """Choose the profile own, with one scanned dataset."""
     params = folder / "params.yaml"
     params.write_text(params.read_text().replace("profile: embedded", "profile: own"))
     if present:
@@ -165,7 +165,7 @@ def set_own(folder: Path, present: str = "") -> None:
 
 
 @pytest.mark.parametrize("name", ["grab", "taco"])  # taco: not even named in params.yaml
-def test_verifying_a_dataset_that_is_absent_fails_with_what_is_missing_and_where_it_is_to_be_had(here, name):
+def test_verifying_an_absent_dataset_fails_with_its_parts_and_download_pages(here, name):
     set_own(here)
     result = hoidata("raw", "verify", name)
     adapter = get_adapter(name)
@@ -177,14 +177,14 @@ def test_verifying_a_dataset_that_is_absent_fails_with_what_is_missing_and_where
     assert result.exit_code == 1
 
 
-def test_verifying_whatever_is_there_does_not_complain_of_what_is_not(here):
+def test_verifying_all_present_datasets_ignores_absent_ones(here):
     set_own(here)
     result = hoidata("raw", "verify")
     assert result.exit_code == 0
     assert "grab: not present" in result.stdout
 
 
-def test_verifying_files_whose_folder_is_gone_fails_with_where_they_are_to_be_had(here):
+def test_verifying_files_of_a_deleted_folder_fails_with_download_pages(here):
     set_own(here, present="grab")
     for words in (["raw", "verify", "grab"], ["raw", "verify"]):
         result = hoidata(*words)
@@ -193,7 +193,7 @@ def test_verifying_files_whose_folder_is_gone_fails_with_where_they_are_to_be_ha
             assert part in result.stdout
 
 
-def test_scanning_speaks_of_the_dataset_before_it_speaks_of_mano(here, tmp_path):
+def test_a_scan_reports_missing_dataset_files_before_missing_mano_files(here, tmp_path):
     params = yaml.safe_load((here / "params.yaml").read_text())
     params["datasets"].append("taco")
     (here / "params.yaml").write_text(yaml.safe_dump(params))
@@ -212,7 +212,7 @@ def test_scanning_speaks_of_the_dataset_before_it_speaks_of_mano(here, tmp_path)
         (root / path).write_bytes(b"")
     complete = hoidata("raw", "scan", "taco", "--root", str(root)).exception
     assert isinstance(complete, MissingResource)
-    assert str(complete).startswith("taco holds MANO parameters and no MANO files are registered")
+    assert str(complete).startswith("taco has MANO parameters and no MANO files are registered")
     assert not is_present(here, "taco")
 
 
@@ -225,11 +225,11 @@ def test_unknown_keys_of_a_section_fail_and_list_the_known_ones(project):
         load_settings(TrainParams, "train", path)
 
 
-def test_places_of_two_profiles_never_meet():
-    embedded, own = StagePaths("embedded", "grab", "contact"), StagePaths("own", "grab", "contact")
+def test_paths_of_two_profiles_differ():
+    generated, user = StagePaths("embedded", "grab", "contact"), StagePaths("own", "grab", "contact")
     data = ("clips", "annotation", "contact", "splits")
     for name in (*data, "checkpoint", "metrics", "report", "manifest", "hand_manifest"):
-        assert getattr(embedded, name) != getattr(own, name)
+        assert getattr(generated, name) != getattr(user, name)
 
 
 def test_any_profile_whose_manifests_are_recipes_has_generated_files_and_the_embedded_hand(project, monkeypatch):
@@ -240,22 +240,22 @@ def test_any_profile_whose_manifests_are_recipes_has_generated_files_and_the_emb
         raw_root(StagePaths("mine", "grab"))
 
 
-def test_outside_of_a_project_the_command_says_so(tmp_path, project_tools):
+def test_commands_outside_of_a_project_are_refused(tmp_path, project_tools):
     result = project_tools.run(tmp_path, "hoidata", "doctor")
     assert result.returncode == 1
     assert "no hoidata project" in result.stderr
 
 
 @pytest.mark.slow
-def test_doctor_accepts_the_pythons_that_an_installation_does():
+def test_doctor_accepts_the_python_versions_of_the_package():
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     accepted = SpecifierSet(project["requires-python"])
-    every = [(3, minor) for minor in range(8, 20)]
-    assert [python for python in every if ".".join(map(str, python)) in accepted] == list(PYTHONS)
+    versions = [(3, minor) for minor in range(8, 20)]
+    assert [python for python in versions if ".".join(map(str, python)) in accepted] == list(PYTHONS)
 
 
 @pytest.mark.slow
-def test_doctor_names_every_part(project, project_tools):
+def test_doctor_lists_all_parts(project, project_tools):
     result = project_tools.run(project, "hoidata", "doctor", COLUMNS="200")
     assert result.returncode == 0, result.stdout
     for part in ("torch", "prefect server", "gpu", "hand (embedded)", "text encoder", "raw grab (own)", "CLIP"):

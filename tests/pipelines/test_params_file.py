@@ -1,4 +1,4 @@
-"""params.yaml means to every stage what it means to DVC, and a profile's overlay counts for that profile alone."""
+"""Stages read the same values from params.yaml as DVC, and an overlay affects only its profile."""
 
 import copy
 import json
@@ -19,7 +19,7 @@ from pipelines.lineage.graph import look_up, read_graph
 from pipelines.lineage.locks import parse_locks
 from pipelines.params import chosen_params, load_yaml, read_file, read_params
 from pipelines.stages.base import load_settings, read_section
-from pipelines.stages.code import SECTIONS_OF_DATASETS, own_settings, profile_settings
+from pipelines.stages.code import SECTIONS_OF_DATASETS, dataset_settings, profile_settings
 from pipelines.stages.train import TrainParams
 
 PROJECT = Path(__file__).parents[2]
@@ -31,7 +31,7 @@ SCALARS = (
 
 
 @pytest.mark.parametrize("text", SCALARS)
-def test_a_value_is_what_dvc_reads_it_as(text):
+def test_values_are_parsed_as_dvc_parses_them(text):
     ours, theirs = load_yaml(f"key: {text}\n".encode())["key"], parse_yaml(f"key: {text}\n", "params.yaml")["key"]
     assert (ours, type(ours)) == (theirs, type(theirs))
 
@@ -44,12 +44,12 @@ def test_the_exponent_that_dvc_writes_is_a_number():
 
 
 @pytest.mark.parametrize("value", [1e-5, "1e-05 ", "0.5.1", "nan", "Infinity", "1e999", ""])
-def test_what_is_no_whole_number_is_refused_where_one_is_needed(value):
+def test_other_values_than_integers_are_refused_for_integer_settings(value):
     with pytest.raises(BadInput, match=r"training\.steps: expected int, got"):
         build_config(TrainingConfig, {"steps": value}, "training")
 
 
-def test_numbers_in_a_list_are_read_by_the_same_rule():
+def test_numbers_in_a_list_are_parsed_in_the_same_way():
     from models.text2hoi.contact import ContactConfig
 
     config = build_config(ContactConfig, {"decoder_widths": [1e2, "64", 32]}, "network")
@@ -58,7 +58,7 @@ def test_numbers_in_a_list_are_read_by_the_same_rule():
         build_config(ContactConfig, {"decoder_widths": ["wide"]}, "network")
 
 
-def test_a_key_that_is_given_twice_is_refused_as_dvc_refuses_it(tmp_path):
+def test_a_duplicate_key_is_refused_as_in_dvc(tmp_path):
     (tmp_path / "params.yaml").write_text("contact: {points: 8}\ncontact: {points: 9}\n")
     with pytest.raises(BadInput, match="duplicate key"):
         read_file(tmp_path / "params.yaml")
@@ -67,18 +67,18 @@ def test_a_key_that_is_given_twice_is_refused_as_dvc_refuses_it(tmp_path):
 @pytest.mark.parametrize(
     "text", ["a: !!bool z", "a: !!int ''", "a: !!python/object:os.system x", "a: =", "a: -_", "[a"]
 )
-def test_text_that_is_no_yaml_is_refused_in_words(tmp_path, text):
+def test_malformed_yaml_is_refused_with_a_message(tmp_path, text):
     (tmp_path / "params.yaml").write_text(text)
     with pytest.raises(BadInput, match="expected YAML text"):
         read_file(tmp_path / "params.yaml")
 
 
-def test_a_lock_file_gives_the_numbers_dvc_noted():
+def test_numbers_in_a_lock_file_are_parsed_as_dvc_wrote_them():
     text = b"stages: {train@a: {params: {params.yaml: {train.small: {learning_rate: 1e-05}}}}}"
     assert parse_locks({"dvc.lock": text})["train@a"].params == {"train.small": {"learning_rate": 0.00001}}
 
 
-def test_a_setting_on_the_command_line_is_read_as_in_the_file():
+def test_a_setting_on_the_command_line_is_parsed_as_in_the_file():
     assert read_settings(["margin_frames=1e1", "clips=on"]) == {"margin_frames": 10.0, "clips": "on"}
     with pytest.raises(BadInput, match=r"--setting clips: expected a value as in params.yaml"):
         read_settings(["clips=[1"])
@@ -142,21 +142,21 @@ def test_an_overlay_changes_what_it_names_in_its_profile_and_nothing_else(plain)
     assert embedded == {name: value for name, value in plain.items() if name != "profiles"}
     expected: dict[str, Any] = copy.deepcopy(embedded) | {"profile": "study"}
     expected["annotate"]["encoder"] = "hash"
-    expected["split"]["grab"] = OVERLAY["split"]["grab"]  # a mapping in the place of a name
+    expected["split"]["grab"] = OVERLAY["split"]["grab"]  # a mapping instead of a name
     expected["train"]["small"]["refiner"]["training"]["steps"] = 3
     expected["sample"]["samples"] = 20
     assert study == expected
     assert plain == before
 
 
-def test_every_reader_of_the_params_sees_the_overlay(plain, tmp_path):
+def test_all_readers_of_params_apply_the_overlay(plain, tmp_path):
     path = tmp_path / "params.yaml"
     path.write_text(yaml.safe_dump({**plain, "profile": "study"}))
     assert load_settings(AnnotationSettings, "annotate", path).encoder == "hash"
     assert read_section("sample", path) == read_params(tmp_path)["sample"] == {**plain["sample"], "samples": 20}
 
 
-def test_an_empty_section_of_an_overlay_says_nothing(plain):
+def test_an_empty_section_of_an_overlay_changes_nothing(plain):
     for overlay in (None, {}, {"annotate": None}):
         assert (
             chosen_params({**plain, "profile": "study", "profiles": {"study": overlay}})["annotate"]["encoder"] == "use"
@@ -177,20 +177,20 @@ def test_an_empty_section_of_an_overlay_says_nothing(plain):
         ({"study": {"train": {"size": "full"}}}, "profiles.study.train.size: "),
     ],
 )
-def test_what_cannot_be_laid_over_is_refused_in_whatever_profile_one_is(plain, profiles, message):
+def test_keys_that_a_profile_cannot_override_are_refused_in_all_profiles(plain, profiles, message):
     with pytest.raises(BadInput, match=message):
         chosen_params({**plain, "profiles": profiles})
 
 
 @pytest.mark.parametrize("text", ["[" * 30000, "{a: " * 30000, "- " * 30000])
-def test_params_nested_beyond_reason_are_refused_and_end_no_process(tmp_path, text):
+def test_too_deeply_nested_params_are_refused_and_do_not_crash(tmp_path, text):
     (tmp_path / "params.yaml").write_text(text)
     with pytest.raises(BadInput, match="YAML text"):
         read_file(tmp_path / "params.yaml")
 
 
-def test_a_stage_runs_again_when_a_setting_it_reads_is_laid_over_and_no_other_does(plain):
-    """Every parameter of every stage of dvc.yaml, changed in the overlay alone, changes that stage's file in code/."""
+def test_an_overlay_runs_exactly_the_stages_again_that_read_its_settings(plain):
+    """A change of any stage parameter in the overlay alone changes that stage's file in code/."""
     stages = read_graph(PROJECT).values()
     keys = {(file, key) for stage in stages for file in stage.code for key in stage.params}
     keys |= {(file, f"{'.'.join(SECTIONS_OF_DATASETS[name])}.grab") for name in SECTIONS_OF_DATASETS
@@ -202,7 +202,7 @@ def test_a_stage_runs_again_when_a_setting_it_reads_is_laid_over_and_no_other_do
 
 
 def changed_by_overlay(plain: dict[str, Any], key: str, files: set[str]) -> set[str]:
-    """The files of ``code/`` that an overlay of ``key`` gives other settings."""
+    """The files of ``code/`` that change with an overlay of ``key``."""
     overlay: Any = {"steps": 1} if isinstance(look_up(plain, key), dict) else 7
     for name in reversed(key.split(".")):
         overlay = {name: overlay}
@@ -211,21 +211,21 @@ def changed_by_overlay(plain: dict[str, Any], key: str, files: set[str]) -> set[
 
     def written(values: dict[str, Any], file: str) -> dict[str, str]:
         name = file.removeprefix("code/").removesuffix(".json")
-        return own_settings(chosen_params(values), name) | profile_settings(values, chosen_params(values), name)
+        return dataset_settings(chosen_params(values), name) | profile_settings(values, chosen_params(values), name)
 
     return {file for file in files if written(base, file) != written(with_overlay, file)}
 
 
-def test_what_is_written_is_what_the_stage_reads_so_that_equal_settings_are_equal_text(plain):
+def test_the_file_of_a_stage_has_exactly_the_settings_that_it_reads(plain):
     study = chosen_params({**plain, "profile": "study"})
-    found = profile_settings(plain, study, "train/refiner")
-    (value,) = found.values()
+    settings = profile_settings(plain, study, "train/refiner")
+    (value,) = settings.values()
     assert json.loads(value) == [0, study["train"]["ours"]["refiner"], study["train"]["small"]["refiner"]]
     assert profile_settings(plain, study, "train/contact") == {}
     assert profile_settings(plain, chosen_params(plain), "train/refiner") == {}
 
 
-def test_a_stage_of_a_profile_that_is_not_chosen_is_refused_as_its_settings_are_not_there(tmp_path, project_tools):
+def test_a_stage_of_another_profile_than_the_chosen_one_is_refused(tmp_path, project_tools):
     folder = project_tools.copy_project(tmp_path / "project")
     done = project_tools.run(
         folder, "python", "-m", "pipelines.stages", "split", "--profile", "own", "--dataset", "grab"

@@ -1,4 +1,4 @@
-"""The hook that Prefect loads, and runs whose server ended; test_prefect_security.py has a server."""
+"""The plugin that Prefect loads, and runs whose server has ended; test_prefect_security.py starts a server."""
 
 import asyncio
 import os
@@ -15,18 +15,18 @@ PROJECT = Path(__file__).parents[2]
 
 
 class Client:
-    """Stands in for Prefect's client: knows two deployments."""
+    """A fake of Prefect's client with two deployments."""
 
     async def read_deployment_by_name(self, name: str) -> str:
         return f"original {name}"
 
     async def read_deployments(self, deployment_filter=None):
-        known = ("annotate-arctic", "full-graph")
-        wanted = deployment_filter.name.any_ if deployment_filter else known
-        return [SimpleNamespace(name=name) for name in known if name in wanted]
+        names = ("annotate-arctic", "full-graph")
+        requested = deployment_filter.name.any_ if deployment_filter else names
+        return [SimpleNamespace(name=name) for name in names if name in requested]
 
 
-def test_a_bare_name_finds_its_deployment_and_the_form_with_a_slash_stays_prefects():
+def test_a_bare_name_finds_its_deployment_and_a_name_with_a_slash_is_passed_on():
     class Wrapped(Client):
         pass
 
@@ -37,7 +37,7 @@ def test_a_bare_name_finds_its_deployment_and_the_form_with_a_slash_stays_prefec
         asyncio.run(Wrapped().read_deployment_by_name("anotate-artic"))
 
 
-def test_whoever_types_a_wrong_name_gets_an_answer_and_no_traceback(monkeypatch):
+def test_a_wrong_name_on_the_command_line_gives_a_message_and_no_traceback(monkeypatch):
     class Wrapped(Client):
         pass
 
@@ -47,25 +47,25 @@ def test_whoever_types_a_wrong_name_gets_an_answer_and_no_traceback(monkeypatch)
         asyncio.run(Wrapped().read_deployment_by_name("anotate-artic"))
 
 
-@pytest.mark.parametrize(("found", "message"), [([], "no deployment is named"), ([1, 2], "2 flows have")])
-def test_a_name_that_none_or_several_have_is_refused(found, message):
+@pytest.mark.parametrize(("matches", "message"), [([], "no deployment is named"), ([1, 2], "2 flows have")])
+def test_an_unknown_or_ambiguous_name_is_refused(matches, message):
     with pytest.raises(ValueError, match=message):
-        only_one("annotate-arctic", found, [])
+        only_one("annotate-arctic", matches, [])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("between", ["", "sh"])
-def test_a_process_of_a_flow_run_begins_only_below_its_starter(between):
-    """The process that serves the flows may have ended before its flow run has imported Prefect."""
-    gone = subprocess.Popen(["true"])
-    gone.wait()
+def test_a_flow_run_starts_only_as_a_descendant_of_its_starter(between):
+    """The process that serves the flows may end while its flow run imports Prefect."""
+    ended = subprocess.Popen(["true"])
+    ended.wait()
     code = "import prefect; print('began', end='')"
-    words = ["sh", "-c", f'{sys.executable} -c "{code}"; exit $?'] if between else [sys.executable, "-c", code]
-    told = {}
-    for starter in (gone.pid, os.getpid()):
+    command = ["sh", "-c", f'{sys.executable} -c "{code}"; exit $?'] if between else [sys.executable, "-c", code]
+    outputs = {}
+    for starter in (ended.pid, os.getpid()):
         environment = {**os.environ, SERVING: str(starter), "PREFECT__FLOW_RUN_ID": "any"}
-        told[starter] = subprocess.run(words, cwd=PROJECT, env=environment, capture_output=True, text=True).stdout
-    assert told == {gone.pid: "", os.getpid(): "began"}
+        outputs[starter] = subprocess.run(command, cwd=PROJECT, env=environment, capture_output=True, text=True).stdout
+    assert outputs == {ended.pid: "", os.getpid(): "began"}
 
 
 STATE_WITH_A_STORED_RESULT = """
@@ -91,8 +91,8 @@ except Exception as error:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("guarded", [True, False])
-def test_a_result_that_a_server_names_is_never_unpickled_in_this_folder(tmp_path, guarded):
-    """Without the hook that prefect.toml switches on, it is, and code runs."""
+def test_a_stored_result_is_never_unpickled(tmp_path, guarded):
+    """Without the plugin that prefect.toml enables, the result is unpickled and its code runs."""
     harm = tmp_path / "harm"
     words = [sys.executable, "-c", STATE_WITH_A_STORED_RESULT, str(harm)]
     settings = {"PREFECT_LOGGING_LEVEL": "CRITICAL", **({} if guarded else {"PREFECT_PLUGINS_ENABLED": "false"})}
@@ -103,7 +103,7 @@ def test_a_result_that_a_server_names_is_never_unpickled_in_this_folder(tmp_path
 
 
 @pytest.mark.slow
-def test_runs_that_were_under_way_have_crashed_and_finished_or_waiting_ones_stay_what_they_are():
+def test_active_runs_are_marked_as_crashed_and_finished_or_scheduled_ones_are_unchanged():
     from prefect import flow
     from prefect.client.orchestration import get_client
     from prefect.states import Completed, Pending, Running, Scheduled
@@ -119,6 +119,6 @@ def test_runs_that_were_under_way_have_crashed_and_finished_or_waiting_ones_stay
         runs = [client.create_flow_run(some, state=state) for state in began]
         end_abandoned_runs()
         after = [client.read_flow_run(run.id).state for run in runs]
-    told = [(state.type.value, state.message or "") for state in after if state]
-    assert [kind for kind, _ in told] == ["CRASHED", "CRASHED", "COMPLETED", "SCHEDULED"]
-    assert "hoidata up" in told[0][1]
+    states = [(state.type.value, state.message or "") for state in after if state]
+    assert [kind for kind, _ in states] == ["CRASHED", "CRASHED", "COMPLETED", "SCHEDULED"]
+    assert "hoidata up" in states[0][1]

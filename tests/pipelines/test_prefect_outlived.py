@@ -1,4 +1,4 @@
-"""Nothing of a `hoidata up` that is gone speaks to another user of the machine who takes its port."""
+"""After `hoidata up` is killed, none of its processes connects to another user's server at its port."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ from tests.pipelines.prefect_up import hoidata_up, running_engine
 pytestmark = pytest.mark.first
 NOBODY = 65534
 LISTEN_S = 10
-# Another user takes the port as soon as it is free, and prints what is sent there.
+# Another user listens at the port when it is free, and prints the data that arrive.
 LISTENER = f"""
 import os, socket, sys, time
 if os.geteuid() == 0:
@@ -37,8 +37,8 @@ except TimeoutError:
 
 
 @pytest.mark.long
-def test_a_flow_ends_with_a_killed_hoidata_up_and_sends_nothing_to_a_stranger_at_its_port(tmp_path, project_tools):
-    """As root the stranger is another user; otherwise it is the same one, which makes no difference to the flow."""
+def test_a_flow_ends_with_a_killed_hoidata_up_and_sends_nothing_to_another_server_at_its_port(tmp_path, project_tools):
+    """As root, the other server runs as another user; otherwise as the same one, which the flow cannot distinguish."""
     project = project_tools.copy_project(tmp_path / "project")
     project_tools.make_narrow(project, ["arctic", "manipnet"], ["mean-pose"])
     with hoidata_up(project, project_tools) as up:

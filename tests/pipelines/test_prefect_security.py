@@ -1,4 +1,4 @@
-"""What a web page or another user of this machine gets from the server of `hoidata up`: nothing run, nothing read."""
+"""A web page or another user of this machine cannot run or read anything on the server of `hoidata up`."""
 
 import base64
 import http.client
@@ -51,7 +51,7 @@ def mode(path: Path) -> int:
     return path.stat().st_mode & 0o777
 
 
-def test_every_start_makes_a_key_for_the_owner_alone(tmp_path):
+def test_each_start_writes_a_key_that_only_the_owner_can_read(tmp_path):
     key_file = tmp_path / ".prefect" / "api-key"
     key_file.parent.mkdir(mode=0o755)
     key_file.write_text("an old key that others could read")
@@ -68,7 +68,7 @@ def test_a_key_that_others_could_read_or_write_is_refused(tmp_path, wide):
     key_file = tmp_path / "api-key"
     write_key(key_file)
     key_file.chmod(wide)
-    with pytest.raises(PermissionError, match="`hoidata up` makes a new one"):
+    with pytest.raises(PermissionError, match="`hoidata up` writes a new one"):
         read_key(key_file)
 
 
@@ -106,13 +106,13 @@ def test_a_server_is_only_started_on_a_loopback_address(url, monkeypatch):
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "[::1]"])
-def test_loopback_addresses_are_taken(host, monkeypatch):
+def test_loopback_addresses_are_accepted(host, monkeypatch):
     monkeypatch.setenv("PREFECT_API_URL", f"http://{host}:4321/api/")
     assert api_url() == f"http://{host}:4321/api"
     assert is_loopback(api_url())
 
 
-def test_the_key_goes_to_no_other_machine_and_not_over_the_users_own(tmp_path, monkeypatch):
+def test_the_key_is_not_sent_to_other_machines_and_does_not_replace_the_users_key(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("PREFECT_API_AUTH_STRING", raising=False)
     here = "http://127.0.0.1:4200/api"
@@ -125,7 +125,7 @@ def test_the_key_goes_to_no_other_machine_and_not_over_the_users_own(tmp_path, m
     assert key_for(here) is None
 
 
-def test_hoidata_down_ends_what_holds_the_folders_key_and_says_when_nothing_does(tmp_path, monkeypatch):
+def test_hoidata_down_stops_the_process_with_the_folders_key_or_reports_that_none_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert not stop_running()
     holding = "import time; from hoidata.files.atomic import exclusive\n"
@@ -139,7 +139,7 @@ def test_hoidata_down_ends_what_holds_the_folders_key_and_says_when_nothing_does
 
 
 @pytest.mark.parametrize("left", ["the number of one that has ended", "nothing"])
-def test_hoidata_down_goes_on_where_what_it_stops_ends_by_itself_at_that_moment(tmp_path, monkeypatch, left):
+def test_hoidata_down_succeeds_if_the_process_ends_at_that_moment(tmp_path, monkeypatch, left):
     monkeypatch.chdir(tmp_path)
     gone = subprocess.Popen(["true"])
     gone.wait()
@@ -152,7 +152,7 @@ def test_hoidata_down_goes_on_where_what_it_stops_ends_by_itself_at_that_moment(
 
 
 def held_once():
-    """In place of ``exclusive``: somebody holds it when first asked, and nobody when asked again."""
+    """A fake of ``exclusive``: the lock is taken at the first call and free at the second."""
     answers = iter([BadInput("key", "nobody", "somebody", "wait"), None])
 
     @contextmanager
@@ -164,8 +164,8 @@ def held_once():
     return asked
 
 
-def test_a_stranger_at_the_port_is_not_taken_for_our_server(monkeypatch):
-    """He would be sent the key, and flows would be run as he says."""
+def test_another_process_at_the_port_is_not_accepted_as_our_server(monkeypatch):
+    """It would receive the key and control the flows."""
     monkeypatch.setattr("pipelines.prefect_server.START_TIMEOUT_S", 2)
     ours = subprocess.Popen(["sleep", "60"])
     try:
@@ -178,21 +178,25 @@ def test_a_stranger_at_the_port_is_not_taken_for_our_server(monkeypatch):
 
 @pytest.fixture(scope="module")
 def up(tmp_path_factory, project_tools):
-    """The real server in a copy of the project."""
+    """The running server in a copy of the project."""
     folder = tmp_path_factory.mktemp("security")
     project = project_tools.copy_project(folder / "project")
-    project_tools.make_narrow(project, ["arctic", "manipnet"], ["mean-pose"])  # few deployments are made faster
+    project_tools.make_narrow(
+        project, ["arctic", "manipnet"], ["mean-pose"]
+    )  # few deployments, which are registered faster
     with hoidata_up(project, project_tools) as running:
         running.marker = folder / "command-ran"
         running.key = read_key(project / ".prefect" / "api-key")
         deployments = json.loads(with_key(running, "POST", "/deployments/filter", "{}").body)
-        [running.deployment] = [found["id"] for found in deployments if found["name"] == "annotate-arctic"]
+        [running.deployment] = [
+            deployment["id"] for deployment in deployments if deployment["name"] == "annotate-arctic"
+        ]
         running.attack = json.dumps({"job_variables": {"command": f"touch {running.marker}"}})
         yield running
 
 
 def ask(up, method: str, path: str, body: str | None = None, **headers: str) -> SimpleNamespace:
-    """One request to the API, without the key unless ``headers`` bring it; "_" in a header's name stands for "-"."""
+    """Send a request to the API, with the key only if it is in ``headers``; "_" in a header's name means "-"."""
     connection = http.client.HTTPConnection(urlsplit(up.url).netloc, timeout=30)
     connection.request(method, f"/api{path}", body, {name.replace("_", "-"): text for name, text in headers.items()})
     with connection.getresponse() as response:
@@ -206,18 +210,18 @@ def basic(key: str) -> dict[str, str]:
 
 
 def csrf(up) -> dict[str, str]:
-    """A CSRF token, as those get one who have the key."""
+    """A CSRF token, which the server gives only with the key."""
     token = json.loads(ask(up, "GET", "/csrf-token?client=tests", **basic(up.key)).body)["token"]
     return {"Prefect_Csrf_Token": token, "Prefect_Csrf_Client": "tests"}
 
 
 def with_key(up, method: str, path: str, body: str | None = None) -> SimpleNamespace:
-    """A request as Prefect's own client makes it."""
+    """Send a request as Prefect's client does."""
     return ask(up, method, path, body, **basic(up.key), **csrf(up), Content_Type="application/json")
 
 
 def assert_nothing_came_of_it(up) -> None:
-    """No run but those asked for by name stands on the server, and no command of theirs was run."""
+    """Check that the server has only the given runs, and that no command of an attacker has run."""
     assert json.loads(with_key(up, "POST", "/flow_runs/filter", "{}").body) == []
     assert not up.marker.exists()
 
@@ -228,7 +232,7 @@ def attack_path(up) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["application/json", "text/plain", "application/x-www-form-urlencoded", None])
-def test_what_a_browser_would_send_from_a_page_is_refused(up, kind):
+def test_requests_that_a_page_can_send_from_a_browser_are_refused(up, kind):
     headers = {"Origin": FOREIGN, **({"Content_Type": kind} if kind else {})}
     refused = ask(up, "POST", attack_path(up), up.attack, **headers)
     assert refused.status in (401, 403)
@@ -239,8 +243,8 @@ def test_what_a_browser_would_send_from_a_page_is_refused(up, kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("origin", [FOREIGN, "null", "http://127.0.0.1:9", "http://localhost:4200"])
 def test_preflight_grants_no_other_origin(up, origin):
-    asked = {"Access_Control_Request_Method": "POST", "Access_Control_Request_Headers": "authorization,content-type"}
-    refused = ask(up, "OPTIONS", attack_path(up), Origin=origin, **asked)
+    headers = {"Access_Control_Request_Method": "POST", "Access_Control_Request_Headers": "authorization,content-type"}
+    refused = ask(up, "OPTIONS", attack_path(up), Origin=origin, **headers)
     assert refused.status == 400
     assert "Access-Control-Allow-Origin" not in refused.headers
 
@@ -256,12 +260,12 @@ def test_a_rebound_name_gets_nothing_without_the_key(up, host):
 @pytest.mark.slow
 @pytest.mark.parametrize("key", [None, "hoidata:guess", ""])
 def test_only_the_health_check_answers_without_the_key(up, key):
-    """Every path and method of the API, with a valid CSRF token, so that the key alone decides."""
+    """All paths and methods of the API, with a valid CSRF token, so that only the key is missing."""
     paths = json.loads(with_key(up, "GET", "/openapi.json").body)["paths"]
     wrong = csrf(up) | (basic(key) if key is not None else {})
-    asked = [(method.upper(), path) for path, methods in paths.items() for method in methods]
-    assert len(asked) > 150
-    answered = {path for method, path in asked if ask(up, method, path, "{}", **wrong).status != 401}
+    calls = [(method.upper(), path) for path, methods in paths.items() for method in methods]
+    assert len(calls) > 150
+    answered = {path for method, path in calls if ask(up, method, path, "{}", **wrong).status != 401}
     assert answered == {"/health", "/ready"}
 
 
@@ -286,7 +290,7 @@ def test_sockets_close_without_the_key(up, path, hello):
 
 
 @pytest.mark.slow
-def test_state_on_the_disk_is_for_the_owner_alone(up):
+def test_files_of_the_server_are_readable_by_the_owner_only(up):
     state = up.project / ".prefect"
     assert mode(state) == 0o700
     assert {mode(item) for item in state.iterdir() if item.is_file() and not item.name.startswith(".")} == {0o600}
@@ -295,8 +299,8 @@ def test_state_on_the_disk_is_for_the_owner_alone(up):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("where", ["http", "file"])
-def test_a_hostile_page_in_chromium_runs_nothing_and_reads_nothing(up, where, tmp_path):
+@pytest.mark.parametrize("scheme", ["http", "file"])
+def test_a_hostile_page_in_chromium_runs_nothing_and_reads_nothing(up, scheme, tmp_path):
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     if chromium is None:
         pytest.skip("no chromium on PATH: the page was not opened")
@@ -304,7 +308,7 @@ def test_a_hostile_page_in_chromium_runs_nothing_and_reads_nothing(up, where, tm
     with served(b"") as (report, posted):
         page.write_bytes(hostile_page(up, report))
         with served(page.read_bytes()) as (site, _):
-            address = site if where == "http" else page.as_uri()
+            address = site if scheme == "http" else page.as_uri()
             results = report_of(chromium, address, tmp_path, posted)
     assert results.pop("server reached") == "opaque"
     assert set(results.values()) <= {"blocked", "opaque", "closed", "form sent"}, results
@@ -312,18 +316,18 @@ def test_a_hostile_page_in_chromium_runs_nothing_and_reads_nothing(up, where, tm
 
 
 def hostile_page(up, report: str) -> bytes:
-    """A page that tries every way from a browser to the API, and tells the address ``report`` what came of each.
+    """A page that tries all requests from a browser to the API, and sends the results to the address ``report``.
 
-    It knows the API's address and the deployment, but not the key.
+    It has the API's address and the deployment, but not the key.
     """
-    given = {"API": up.url, "DEPLOYMENT": up.deployment, "ATTACK": up.attack, "SOCKETS": SOCKETS, "REPORT": report}
-    constants = "".join(f"const {name} = {json.dumps(value)};" for name, value in given.items())
+    values = {"API": up.url, "DEPLOYMENT": up.deployment, "ATTACK": up.attack, "SOCKETS": SOCKETS, "REPORT": report}
+    constants = "".join(f"const {name} = {json.dumps(value)};" for name, value in values.items())
     return Path(__file__).with_name("hostile_page.html").read_text().replace("/* given */", constants).encode()
 
 
 @contextmanager
 def served(page: bytes):
-    """A site that answers every GET with ``page``; gives its address, and the bodies of POSTs as they come."""
+    """A web server that answers each GET with ``page``; returns its address and the list of received POST bodies."""
     posted = queue.Queue()
 
     class Site(BaseHTTPRequestHandler):
@@ -351,7 +355,7 @@ def served(page: bytes):
 
 
 def report_of(chromium: str, url: str, folder: Path, posted: queue.Queue) -> dict[str, str]:
-    """What the page at ``url`` posts in headless Chromium, whose own (new) guard of the local network is off."""
+    """The POST body of the page at ``url`` in headless Chromium, with its protection of local networks disabled."""
     switches = [
         "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run",
         "--disable-features=LocalNetworkAccessChecks", f"--user-data-dir={folder / 'profile'}",
@@ -365,13 +369,13 @@ def report_of(chromium: str, url: str, folder: Path, posted: queue.Queue) -> dic
 
 
 @pytest.mark.long
-def test_what_is_typed_in_the_folder_still_runs_and_is_all_that_ran(up, project_tools):
-    """After the tests above: whatever runs this flow has had time for every run they could have started.
+def test_a_deployment_started_in_the_folder_runs_and_is_the_only_run(up, project_tools):
+    """It runs after the tests above, so that any run they started would have had time to appear.
 
-    ``prefect deployment run annotate-arctic`` exactly as typed makes what DVC's target annotate@embedded-arctic is.
+    ``prefect deployment run annotate-arctic`` updates DVC's target annotate@embedded-arctic.
     """
-    asked = project_tools.run(up.project, "prefect", "deployment", "run", "annotate-arctic", **up.settings)
-    assert asked.returncode == 0, asked.stdout + asked.stderr
+    result = project_tools.run(up.project, "prefect", "deployment", "run", "annotate-arctic", **up.settings)
+    assert result.returncode == 0, result.stdout + result.stderr
     [run] = ended_runs(up)
     assert (run["state_type"], run["job_variables"] or {}) == ("COMPLETED", {}), up.log.read_text()
     assert (up.project / "data/embedded/arctic/annotation/text.parquet").is_file()
@@ -379,33 +383,33 @@ def test_what_is_typed_in_the_folder_still_runs_and_is_all_that_ran(up, project_
     assert not up.marker.exists()
     tasks = {run["name"] for run in json.loads(with_key(up, "POST", "/task_runs/filter", "{}").body)}
     assert {CODE, "convert@embedded-arctic", "annotate@embedded-arctic"} <= tasks
-    artifacts = {found["key"] for found in json.loads(with_key(up, "POST", "/artifacts/filter", "{}").body)}
+    artifacts = {artifact["key"] for artifact in json.loads(with_key(up, "POST", "/artifacts/filter", "{}").body)}
     assert artifacts == {"stages", "results"}
 
 
 def ended_runs(up) -> list[dict]:
-    """All runs on the server, once each has ended."""
+    """Wait until all runs have ended, and return them."""
     runs = lambda: json.loads(with_key(up, "POST", "/flow_runs/filter", "{}").body)  # noqa: E731
     wait_until(lambda: all(run["state_type"] in ENDED for run in runs()), 900, up.process, up.log)
     return runs()
 
 
 @pytest.mark.long
-def test_a_run_brings_no_command_environment_or_folder_of_its_own_even_with_the_key(up):
-    """What a worker of a work pool would obey; the process that serves the flows does not read it."""
+def test_a_run_cannot_set_command_environment_or_folder_even_with_the_key(up):
+    """A worker of a work pool would obey these fields; the process that serves the flows ignores them."""
     harm = f"touch {up.marker}"
     names = ("command", "working_dir", "image", "entrypoint", "stream_output")
     variables = {**dict.fromkeys(names, harm), "env": {"PATH": "/nowhere", "PREFECT__FLOW_ENTRYPOINT": harm}}
-    asked = with_key(up, "POST", attack_path(up), json.dumps({"job_variables": variables}))
-    assert asked.status == 201, asked.body
+    response = with_key(up, "POST", attack_path(up), json.dumps({"job_variables": variables}))
+    assert response.status == 201, response.body
     [run] = [run for run in ended_runs(up) if run["job_variables"]]
-    assert (run["id"], run["state_type"]) == (json.loads(asked.body)["id"], "COMPLETED"), up.log.read_text()
+    assert (run["id"], run["state_type"]) == (json.loads(response.body)["id"], "COMPLETED"), up.log.read_text()
     assert not up.marker.exists()
 
 
 @pytest.mark.slow
 def test_the_flow_and_what_started_it_end_with_the_server(up, project_tools):
-    """Last of all. Otherwise the next one to take the port could tell them what to run."""
+    """The last test. Otherwise the next server at the port could control them."""
     engine = running_engine(up.project, project_tools, up)
     children = {child.cmdline()[2]: child for child in psutil.Process(up.process.pid).children()}
     children["prefect"].kill()

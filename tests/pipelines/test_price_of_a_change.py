@@ -1,6 +1,6 @@
-"""What runs again after a change, as DVC says on a copy of the project in which everything was up to date.
+"""The stages that DVC runs again after a change, on a copy of the project in which all stages were up to date.
 
-``python -m tests.pipelines.test_price_of_a_change`` writes the table of ARCHITECTURE.md anew.
+``python -m tests.pipelines.test_price_of_a_change`` updates the table in ARCHITECTURE.md.
 """
 
 import contextlib
@@ -36,7 +36,7 @@ pytestmark = pytest.mark.long
 
 
 def touch(*paths: str) -> Callable[[Path], None]:
-    """Append a line to files that are there."""
+    """Append a line to existing files."""
 
     def edit(project: Path) -> None:
         for path in paths:
@@ -86,7 +86,7 @@ def set_in_embedded(project: Path) -> None:
 
 @dataclass(frozen=True)
 class Change:
-    """An edit in words and as a function of the project, and the stages DVC must name (as in ``stages_in_words``)."""
+    """An edit, in words and as a function of the project, and the stages that it makes stale (``stages_in_words``)."""
 
     words: str
     edit: Callable[[Path], None]
@@ -139,7 +139,7 @@ CHANGES = (
 
 @contextlib.contextmanager
 def up_to_date_project(folder: Path) -> Iterator[Path]:
-    """A copy of the committed files, the current folder meanwhile, in which each output is a stand-in DVC knows."""
+    """A copy of the committed files as the current folder, with a fake file for each output that DVC accepts."""
     from dvc.repo import Repo
 
     listed = subprocess.run(
@@ -174,12 +174,12 @@ def run(*command: str) -> None:
 
 
 def write_code() -> None:
-    """The stage itself, on the copy's own code."""
+    """Run the stage code with the code of the copy."""
     run(sys.executable, "-m", "pipelines.stages", "code")
 
 
 def stale_stages() -> set[str]:
-    """What DVC would run, but for ``code``, which always runs."""
+    """The stages that DVC would run, except ``code``, which always runs."""
     from dvc.repo import Repo
 
     write_code()
@@ -201,26 +201,26 @@ def reads_from(stage: Stage, makers: set[str], graph: dict[str, Stage]) -> bool:
 
 
 def stages_in_words(names: set[str], datasets: list[str], graph: dict[str, Stage]) -> str:
-    """``convert of grab``: the datasets only where not all of them are meant, families where not all."""
+    """Stage names such as ``convert of grab``; datasets and families are listed only if some are missing."""
     families = read_params(Path())["families"]
-    of: dict[str, set[str]] = {}
+    members: dict[str, set[str]] = {}
     for name in names:
-        stage, _, rest = name.rpartition(":")[2].partition("@")
-        dataset = rest.removeprefix("embedded").strip("-").partition("-")[0]
-        asked = {Path(out).name for out in graph[name].outs if out.startswith("samples/")} & set(families)
-        of.setdefault(stage, set()).add(dataset)
-        of.setdefault(f"families of {stage}", set()).update(asked)
+        stage, _, run = name.rpartition(":")[2].partition("@")
+        dataset = run.removeprefix("embedded").strip("-").partition("-")[0]
+        sampled = {Path(out).name for out in graph[name].outs if out.startswith("samples/")} & set(families)
+        members.setdefault(stage, set()).add(dataset)
+        members.setdefault(f"families of {stage}", set()).update(sampled)
     groups: dict[str, list[str]] = {}
-    for stage in sorted(key for key in of if not key.startswith("families of ")):
-        asked = of[f"families of {stage}"]
-        shown = f"{stage} ({', '.join(sorted(asked))})" if asked and asked != set(families) else stage
-        where = "" if of[stage] in ({""}, set(datasets)) else f" of {', '.join(sorted(of[stage]))}"
-        groups.setdefault(where, []).append(shown)
-    return "; ".join(f"{', '.join(stages)}{where}" for where, stages in sorted(groups.items())) or "nothing"
+    for stage in sorted(key for key in members if not key.startswith("families of ")):
+        sampled = members[f"families of {stage}"]
+        shown = f"{stage} ({', '.join(sorted(sampled))})" if sampled and sampled != set(families) else stage
+        suffix = "" if members[stage] in ({""}, set(datasets)) else f" of {', '.join(sorted(members[stage]))}"
+        groups.setdefault(suffix, []).append(shown)
+    return "; ".join(f"{', '.join(stages)}{suffix}" for suffix, stages in sorted(groups.items())) or "nothing"
 
 
 def price(change: Change) -> tuple[str, ...]:
-    """What DVC runs again after the change, and what may follow, in words; the copy is as before afterwards."""
+    """The stages that DVC runs again after a change, and those that may follow, in words; then reverts the change."""
     change.edit(Path())
     try:
         stale, datasets, graph = stale_stages(), read_params(Path())["datasets"], read_graph(Path())
@@ -249,35 +249,35 @@ def prices(copy: Path) -> dict[str, tuple[str, ...]]:
 
 
 @pytest.mark.parametrize("change", CHANGES, ids=lambda change: change.words)
-def test_a_change_runs_again_what_it_concerns_and_nothing_else(prices, change):
+def test_a_change_runs_exactly_the_stages_again_that_it_concerns(prices, change):
     assert prices[change.words][0] == change.runs
 
 
-def test_a_metric_and_a_page_never_train_or_sample(prices):
+def test_a_change_of_a_metric_or_page_never_trains_or_samples(prices):
     for change in CHANGES[:2]:
         assert not {"train", "sample"} & set(" ".join(prices[change.words]).replace(",", "").split())
 
 
-def test_the_table_of_the_architecture_is_this_one(prices):
+def test_the_table_in_architecture_is_up_to_date(prices):
     assert table(prices) in ARCHITECTURE.read_text(), "run python -m tests.pipelines.test_price_of_a_change"
 
 
-@pytest.mark.filterwarnings("ignore:_NoneStep")  # pygtrie's, as DVC calls it
-def test_all_stages_run_before_the_report_which_asks_for_parent_folders(copy):
+@pytest.mark.filterwarnings("ignore:_NoneStep")  # raised by pygtrie, which DVC uses
+def test_all_stages_run_before_the_report_which_depends_on_parent_folders(copy):
     from dvc.repo import Repo
 
     with Repo() as repo:
         stages = {stage.addressing: stage for stage in repo.index.stages}
-        behind, waiting = set(), ["report@embedded"]
+        visited, waiting = set(), ["report@embedded"]
         while waiting:
-            found = {stage.addressing for stage in repo.index.graph.successors(stages[waiting.pop()])} - behind
-            behind |= found
-            waiting += found
-    assert behind == stages.keys() - {"report@embedded"}
+            upstream = {stage.addressing for stage in repo.index.graph.successors(stages[waiting.pop()])} - visited
+            visited |= upstream
+            waiting += upstream
+    assert visited == stages.keys() - {"report@embedded"}
 
 
 @pytest.mark.parametrize("folder", ["data", "checkpoints", "samples", "metrics"])
-def test_another_output_of_any_stage_makes_the_report_anew(copy, folder):
+def test_a_changed_output_of_any_stage_runs_the_report_again(copy, folder):
     from dvc.repo import Repo
 
     path = next(path for path in sorted((copy / folder).rglob("*")) if path.is_file())
@@ -291,11 +291,11 @@ def test_another_output_of_any_stage_makes_the_report_anew(copy, folder):
 
 
 def write_table() -> None:
-    """Put the table of today into ARCHITECTURE.md."""
+    """Write the current table to ARCHITECTURE.md."""
     with tempfile.TemporaryDirectory() as folder, up_to_date_project(Path(folder)):
-        made = table({change.words: price(change) for change in CHANGES})
+        table_text = table({change.words: price(change) for change in CHANGES})
     before, _, rest = ARCHITECTURE.read_text().partition(BEGIN)
-    ARCHITECTURE.write_text(before + made + rest.partition(END)[2])
+    ARCHITECTURE.write_text(before + table_text + rest.partition(END)[2])
 
 
 if __name__ == "__main__":

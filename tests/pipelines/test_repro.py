@@ -1,4 +1,4 @@
-"""The whole graph as a user runs it, with GRAB present and ARCTIC not, small corpora and a few steps per model."""
+"""The whole graph, with GRAB present and ARCTIC absent, small corpora and a few steps per network."""
 
 import json
 import re
@@ -21,7 +21,7 @@ MODELS = ("contact", "length", "diffusion", "refiner")
 
 
 def stages_run(output: str) -> list[str]:
-    """The stages ``dvc repro`` says it runs; ``code`` always does."""
+    """The stages that ``dvc repro`` reports as run, except ``code``, which always runs."""
     return re.findall(r"Running stage '([^']+)'", output)
 
 
@@ -33,7 +33,7 @@ def test_all_models_of_the_present_dataset_are_trained_and_those_of_the_others_a
         assert reason == "arctic is not present in the profile embedded"
 
 
-def test_each_checkpoint_records_what_it_was_trained_on(built):
+def test_each_checkpoint_records_its_training_data(built):
     for model in MODELS:
         metadata = read_metadata(built / "checkpoints/embedded/grab" / model / "model.safetensors")
         provenance = metadata["provenance"]
@@ -43,8 +43,8 @@ def test_each_checkpoint_records_what_it_was_trained_on(built):
         assert all(clip.startswith(("grab/s1/", "grab/s2/")) for clip in provenance["clips"]["train"])
 
 
-def test_metrics_and_report_are_there_and_say_synthetic(built, project_tools):
-    """As users of DVC ask for them: leading figures of every family, a bar for each, the losses of each network."""
+def test_metrics_and_report_exist_and_say_synthetic(built, project_tools):
+    """The outputs for DVC: leading metrics of all families, a bar chart, and the losses of each network."""
     shown = json.loads(project_tools.run(built, "dvc", "metrics", "show", "--json").stdout)
     (file,) = shown[""]["data"].values()
     assert file["data"]["grab"].keys() == {"text2hoi", "ground-truth"}
@@ -57,7 +57,7 @@ def test_metrics_and_report_are_there_and_say_synthetic(built, project_tools):
     assert "synthetic" in (built / "report/embedded/index.html").read_text().lower()
 
 
-def test_lineage_names_everything_behind_each_checkpoint(built, monkeypatch):
+def test_lineage_lists_all_inputs_of_each_checkpoint(built, monkeypatch):
     monkeypatch.chdir(built)
     for model in MODELS:
         result = CliRunner().invoke(app, ["lineage", f"checkpoints/embedded/grab/{model}", "--json"])
@@ -72,10 +72,10 @@ def test_lineage_names_everything_behind_each_checkpoint(built, monkeypatch):
             assert f'"name": "{name}"' in result.stdout
 
 
-def test_lineage_check_finds_every_output_as_dvc_wrote_it(built, project_tools):
+def test_lineage_check_finds_all_outputs_unchanged(built, project_tools):
     result = project_tools.run(built, "hoidata", "lineage", "check")
     assert result.returncode == 0, result.stdout + result.stderr
-    assert result.stdout.endswith(", 0 not as they were written\n")
+    assert result.stdout.endswith(", 0 not as written\n")
 
 
 @pytest.mark.long
@@ -90,7 +90,7 @@ def test_lineage_rerun_trains_the_same_weights_in_a_clean_clone(built, project_t
         assert project_tools.run(built, "git", "update-ref", "-d", "HEAD").returncode == 0
 
 
-def test_lineage_says_what_has_changed_since(built, project_tools):
+def test_lineage_reports_changed_inputs(built, project_tools):
     with kept(built / "params.yaml") as params:
         values = yaml.safe_load(params)
         values["annotate"]["threshold_m"] = 0.03
@@ -119,7 +119,7 @@ def test_a_failing_conversion_leaves_the_clips_in_place(built, project_tools):
 
 
 @pytest.mark.long
-def test_going_to_the_other_profile_and_back_runs_nothing_again(built, project_tools):
+def test_switching_profiles_back_and_forth_runs_nothing_again(built, project_tools):
     with kept(built / "params.yaml") as params:
         project_tools.write_params(built, {**yaml.safe_load(params), "profile": "own"})
         other = project_tools.run(built, "dvc", "repro", "models/text2hoi/dvc.yaml:train@own-grab-contact")
@@ -128,7 +128,7 @@ def test_going_to_the_other_profile_and_back_runs_nothing_again(built, project_t
     assert stages_run(project_tools.run(built, "dvc", "repro").stdout) == [CODE]
 
 
-def test_a_dataset_that_becomes_present_runs_its_own_stages_only(built, project_tools):
+def test_a_dataset_that_becomes_present_runs_only_its_stages(built, project_tools):
     with kept(built / "manifests/embedded/arctic.json"):
         project_tools.set_present(built, {"grab", "arctic"})
         status = json.loads(project_tools.run(built, "dvc", "status", "--json").stdout)
@@ -137,7 +137,7 @@ def test_a_dataset_that_becomes_present_runs_its_own_stages_only(built, project_
 
 
 @pytest.mark.long
-def test_the_same_seed_generates_the_same_bytes_on_a_mesh_of_the_users(built, project_tools, tmp_path):
+def test_the_same_seed_generates_the_same_bytes_for_a_mesh_file(built, project_tools, tmp_path):
     trimesh.creation.box((0.06, 0.08, 0.1)).export(tmp_path / "box.obj")
     for out in ("first", "second"):
         result = project_tools.run(
@@ -150,11 +150,11 @@ def test_the_same_seed_generates_the_same_bytes_on_a_mesh_of_the_users(built, pr
         assert first.read_bytes() == second.read_bytes()
 
 
-def test_generation_says_which_objects_there_are_and_which_meshes_cannot_be_meant(built, tmp_path, monkeypatch):
+def test_generation_refuses_unknown_objects_and_unusable_meshes(built, tmp_path, monkeypatch):
     monkeypatch.chdir(built)
     trimesh.creation.box((60, 80, 100)).export(tmp_path / "millimetres.obj")
     for object_name, message in ((str(tmp_path / "millimetres.obj"), "--unit mm makes it 10 cm"), ("ufo", "one of:")):
-        asked = ["generate", "Lift it.", "--object", object_name, "--out", str(tmp_path / "out")]
-        refused = CliRunner().invoke(app, asked).exception
+        arguments = ["generate", "Lift it.", "--object", object_name, "--out", str(tmp_path / "out")]
+        refused = CliRunner().invoke(app, arguments).exception
         assert isinstance(refused, BadInput)
         assert message in str(refused)

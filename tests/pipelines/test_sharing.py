@@ -1,4 +1,4 @@
-"""What is derived from licensed data stays here unless the user says otherwise."""
+"""Data derived from licensed data is not pushed unless the user chooses to share it."""
 
 import shutil
 import tomllib
@@ -9,11 +9,11 @@ import pytest
 import yaml
 
 PROJECT = Path(__file__).parents[2]
-MAY_LEAVE = ("raw.json", "metrics/", "code")  # digests and figures
+MAY_LEAVE = ("raw.json", "metrics/", "code")  # digests and metrics
 
 
 def outputs(project: Path) -> dict[str, dict]:
-    """Every cached output of the graph with its flags."""
+    """All cached outputs of the graph with their flags."""
     stages = yaml.safe_load((project / "dvc.yaml").read_text())["stages"].values()
     outs = [out for stage in stages for out in stage.get("outs", []) + stage.get("metrics", [])]
     return {path: flags for out in outs for path, flags in (out if isinstance(out, dict) else {out: {}}).items()}
@@ -30,7 +30,7 @@ def test_no_derived_data_is_pushed_as_delivered():
 
 
 @pytest.mark.slow
-def test_sharing_needs_a_remote_to_share_with(project, project_tools):
+def test_sharing_needs_a_remote(project, project_tools):
     refused = project_tools.run(project, "hoidata", "share", "--on")
     assert refused.returncode == 1
     assert "dvc remote add" in refused.stderr
@@ -38,7 +38,7 @@ def test_sharing_needs_a_remote_to_share_with(project, project_tools):
 
 @pytest.fixture
 def built(project, project_tools, tmp_path) -> SimpleNamespace:
-    """A project with clips, its remote, and the commands of this module in words."""
+    """A project with clips, its remote, and functions that run the commands of this module."""
     remote = tmp_path / "remote"
 
     def run(*command: str, folder: Path = project) -> str:
@@ -51,10 +51,10 @@ def built(project, project_tools, tmp_path) -> SimpleNamespace:
         run("git", "-c", "user.name=a", "-c", "user.email=b", "commit", "-qm", "built")
 
     def push(*options: str) -> set[str]:
-        """Names of the files on the remote after ``dvc push``: digests of what they hold."""
+        """The names of the files on the remote after ``dvc push``, which are their digests."""
         run("dvc", "push", *options)
-        found = [path.relative_to(remote) for path in remote.rglob("*") if path.is_file()]
-        return {"".join(path.parts[-2:]) for path in found if "runs" not in path.parts}
+        files = [path.relative_to(remote) for path in remote.rglob("*") if path.is_file()]
+        return {"".join(path.parts[-2:]) for path in files if "runs" not in path.parts}
 
     run("dvc", "repro", "convert@embedded-manipnet")
     run("dvc", "remote", "add", "-d", "there", str(remote))
@@ -69,7 +69,7 @@ def built(project, project_tools, tmp_path) -> SimpleNamespace:
 
 
 @pytest.mark.long
-def test_sharing_that_is_off_sends_nothing_derived_whatever_was_pushed_before(built):
+def test_with_sharing_off_no_derived_data_is_sent_whatever_was_pushed_before(built):
     every_way = ((), ("--all-commits",), ("--run-cache",), ("-r", "there"))
     for options in every_way:
         assert built.push(*options) == built.may_leave, options
@@ -85,7 +85,7 @@ def test_sharing_that_is_off_sends_nothing_derived_whatever_was_pushed_before(bu
 
 
 @pytest.mark.long
-def test_a_clone_pulls_what_is_shared_also_after_it_tried_too_early(built, project_tools, tmp_path):
+def test_a_clone_pulls_shared_data_also_after_a_failed_pull(built, project_tools, tmp_path):
     assert built.push() == built.push() == built.may_leave
     built.run("hoidata", "share", "--on")
     assert built.push() > built.clips
@@ -99,22 +99,22 @@ def test_a_clone_pulls_what_is_shared_also_after_it_tried_too_early(built, proje
 
 
 @pytest.mark.parametrize("address", ["s3://bucket/team", "s3://bucket/team/", "ssh://host/a"])
-def test_derived_outputs_never_have_the_address_of_the_others(project, monkeypatch, address):
-    """DVC's index of an address is kept from one push to the next, whichever remotes outputs had meanwhile."""
-    from pipelines.commands.share import _config, _keep_here, _lead_out
+def test_derived_and_other_outputs_have_different_addresses(project, monkeypatch, address):
+    """DVC keeps its index of an address between pushes, even if outputs move to another remote."""
+    from pipelines.commands.share import _config, _keep_derived, _share_derived
 
     monkeypatch.chdir(project)
     with _config().edit() as config:
         config["core"]["remote"] = "team"
         config["remote"]["team"] = {"url": address}
-    assert _lead_out() == f"{address.rstrip('/')}/derived"
+    assert _share_derived() == f"{address.rstrip('/')}/derived"
     shared, plain = (_config()["remote"][name]["url"].rstrip("/") for name in ("derived", "team"))
     assert shared != plain
-    _keep_here()
+    _keep_derived()
     assert Path(_config()["remote"]["derived"]["url"]).resolve() == (project / ".dvc/cache").resolve()
 
 
-def test_plain_dvc_and_prefect_typed_in_this_folder_send_nothing_home(monkeypatch):
+def test_dvc_and_prefect_in_this_folder_send_no_analytics(monkeypatch):
     from dvc.analytics import is_enabled
     from dvc.config import Config
 

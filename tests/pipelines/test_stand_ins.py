@@ -1,4 +1,4 @@
-"""What stands in the place of MANO or CLIP is said wherever a person looks at what was made with it."""
+"""Data made without MANO or CLIP comes with a warning in tables, cards and pages."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,31 +37,33 @@ def test_mano_parameters_converted_with_the_embedded_hand_come_with_a_warning(
     assert capsys.readouterr().out.startswith(f"warning: {name} has MANO parameters, and the embedded hand is no MANO")
     store = open_store(tmp_path / "store")
     assert NUMBERS in dict(fact_rows(store))["hand model"]
-    card = dataset_card(store.folder, store, Description("the store", WORLD, "as they are", (), True))
+    card = dataset_card(store.folder, store, Description("the store", WORLD, "as stored", columns=(), for_own_use=True))
     assert f"- Warning: {name} has MANO parameters" in card
 
 
-def test_generated_files_fitted_hands_and_mano_itself_come_without_a_warning(tmp_path: Path) -> None:
-    """Generated raw files were made with the embedded hand; ManipNet's hands are fitted to the one that is there."""
+def test_generated_files_fitted_hands_and_mano_have_no_warning(tmp_path: Path) -> None:
+    """Generated files use the embedded hand, and ManipNet's hands are fitted to the available hand model."""
     arctic.write_two(tmp_path / "raw")
     (tmp_path / "mano").mkdir()
     for model in (load_embedded_hands().left, load_embedded_hands().right):
         write_mano_pickle(model, tmp_path / "mano" / f"MANO_{model.side.upper()}.pkl")
     mano, adapter, raw = load_mano_hands(tmp_path / "mano"), get_adapter("arctic"), tmp_path / "raw"
-    made = {
+    summaries = {
         "generated": convert_dataset(
             adapter, raw, load_embedded_hands(), tmp_path / "a", progress=False, synthetic=True
         ),
         "with MANO": convert_dataset(adapter, raw, mano, tmp_path / "b", progress=False),
     }
-    assert {name: (found.clips > 0, found.warning) for name, found in made.items()} == dict.fromkeys(made, (True, ""))
+    assert {name: (summary.clips > 0, summary.warning) for name, summary in summaries.items()} == dict.fromkeys(
+        summaries, (True, "")
+    )
     facts = {"dataset": "h2o", "synthetic": False, "hand_model": {"name": "embedded"}}
     shapes = {"betas per frame": True, "betas per sequence": True, "personal mesh": True, "fitted": False}
-    told = {shape: bool(stand_in_note(facts | {"hand_convention": {"shape": shape}})) for shape in shapes}
-    assert told == shapes
+    has_note = {shape: bool(stand_in_note(facts | {"hand_convention": {"shape": shape}})) for shape in shapes}
+    assert has_note == shapes
 
 
-def test_adapters_check_says_how_far_the_embedded_hand_is_off_where_mano_is_meant() -> None:
+def test_adapters_check_states_the_error_of_the_embedded_hand_for_mano_data() -> None:
     assert NUMBERS in _hands("embedded", needs_mano=True)[1]
     assert _hands("embedded", needs_mano=False)[1] == "hand: embedded"
 

@@ -1,4 +1,4 @@
-"""A model family is a folder and a row: one that learns is added to a copy of the project, and everything serves it."""
+"""A model family is a folder and a registry entry: the toy family is trained, sampled, measured and shown."""
 
 import json
 import re
@@ -24,7 +24,7 @@ OWN_STAGES = [
 
 
 def add_line(path: Path, before: str, line: str) -> None:
-    """Type one line in front of the first one that starts with ``before``."""
+    """Insert a line before the first one that starts with ``before``."""
     lines = path.read_text().splitlines(keepends=True)
     at = next(number for number, text in enumerate(lines) if text.startswith(before))
     path.write_text("".join([*lines[:at], line + "\n", *lines[at:]]))
@@ -34,7 +34,7 @@ def test_a_family_of_one_folder_trains_samples_is_measured_and_shown(built: Path
     project, params = built, built / "params.yaml"
     shutil.copytree(FOLDER, project / "models" / "toy", ignore=shutil.ignore_patterns("__pycache__"))
     (project / "models" / "toy" / "__init__.py").touch()
-    # Under its own name DVC would take the file for one of this project's.
+    # Named dvc.yaml, DVC would read the file as part of this project.
     (project / "models" / "toy" / "stages.yaml").rename(project / "models" / "toy" / "dvc.yaml")
     typed = (
         (project / "models" / "registry.py", '    "nearest-clip"', '    "toy": "models.toy.family:TOY",'),

@@ -1,4 +1,4 @@
-"""A stage run by the warm process is the one it would be by itself, with the same bits on every processor."""
+"""The warm process runs a stage like a new process does, with the same bits on all processors."""
 
 import json
 import os
@@ -39,7 +39,7 @@ ASK = "import sys; from pipelines.warm import run_warm; sys.exit(run_warm('act',
 
 @pytest.fixture
 def warm(tmp_path: Path):
-    """A folder with the module ``act``, and the environment of a process that asks there."""
+    """A folder with the module ``act``, and the environment of a requesting process in it."""
     (tmp_path / "act.py").write_text(ACT)
     path = tmp_path / "socket"
     paths = os.pathsep.join((str(tmp_path), os.getcwd()))
@@ -55,24 +55,24 @@ def warm(tmp_path: Path):
     assert server.returncode == 0
 
 
-def ask(warm: dict[str, str], folder: Path, what: str) -> subprocess.Popen:
-    return subprocess.Popen([sys.executable, "-c", ASK, what], cwd=folder, env=warm, start_new_session=True)
+def ask(warm: dict[str, str], folder: Path, action: str) -> subprocess.Popen:
+    return subprocess.Popen([sys.executable, "-c", ASK, action], cwd=folder, env=warm, start_new_session=True)
 
 
-@pytest.mark.parametrize(("what", "code"), [("do", 3), ("raise", 1), ("die", KILLED)])
-def test_a_stage_says_and_answers_what_it_would_by_itself(warm, tmp_path: Path, what: str, code: int) -> None:
+@pytest.mark.parametrize(("action", "code"), [("do", 3), ("raise", 1), ("die", KILLED)])
+def test_a_stage_has_the_output_and_exit_code_of_a_new_process(warm, tmp_path: Path, action: str, code: int) -> None:
     both = [
-        subprocess.run([sys.executable, *call, what], cwd=tmp_path, env=warm, capture_output=True, text=True)
+        subprocess.run([sys.executable, *call, action], cwd=tmp_path, env=warm, capture_output=True, text=True)
         for call in (("-c", ASK), ("-m", "act"))
     ]
-    asked, own = both
-    assert asked.stdout == own.stdout.replace("True", "False") == f"{what} {tmp_path} given False __main__\n"
-    assert asked.stderr.splitlines()[0] == "said"
-    assert asked.stderr.splitlines()[-1] == own.stderr.splitlines()[-1]
-    assert (asked.returncode, own.returncode) == (code, -signal.SIGKILL if what == "die" else code)
+    warm_run, new_run = both
+    assert warm_run.stdout == new_run.stdout.replace("True", "False") == f"{action} {tmp_path} given False __main__\n"
+    assert warm_run.stderr.splitlines()[0] == "said"
+    assert warm_run.stderr.splitlines()[-1] == new_run.stderr.splitlines()[-1]
+    assert (warm_run.returncode, new_run.returncode) == (code, -signal.SIGKILL if action == "die" else code)
 
 
-def test_a_signal_for_the_one_that_asks_is_for_the_stage(warm, tmp_path: Path) -> None:
+def test_signals_are_passed_on_to_the_stage(warm, tmp_path: Path) -> None:
     asking = ask(warm, tmp_path, "wait")
     until((tmp_path / "began").exists, 20)
     asking.send_signal(signal.SIGTERM)
@@ -80,7 +80,7 @@ def test_a_signal_for_the_one_that_asks_is_for_the_stage(warm, tmp_path: Path) -
     assert (tmp_path / "stopped").exists()
 
 
-def test_a_stage_ends_with_the_one_that_asked(warm, tmp_path: Path) -> None:
+def test_a_stage_ends_with_the_requesting_process(warm, tmp_path: Path) -> None:
     asking = ask(warm, tmp_path, "wait")
     until((tmp_path / "began").exists, 20)
     fork = [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit() and socket_of(entry, warm)]
@@ -90,8 +90,8 @@ def test_a_stage_ends_with_the_one_that_asked(warm, tmp_path: Path) -> None:
     until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in fork), 20)
 
 
-def test_a_stage_ends_with_one_that_was_killed_before_it_read_all() -> None:
-    said = """import os, socket
+def test_a_stage_ends_if_the_requesting_process_is_killed_before_it_read_everything() -> None:
+    output_of = """import os, socket
 from pipelines import warm
 os.setsid()
 stage, asking = socket.socketpair()
@@ -99,13 +99,13 @@ stage.send(b"an answer that nobody reads")
 asking.close()  # so that the stage is told of a reset, not of an end
 warm._pass_signals_on(stage)"""
     assert (
-        subprocess.run([sys.executable, "-c", said], cwd=Path(__file__).parents[2], check=False).returncode
+        subprocess.run([sys.executable, "-c", output_of], cwd=Path(__file__).parents[2], check=False).returncode
         == -signal.SIGKILL
     )
 
 
 def socket_of(process: Path, warm: dict[str, str]) -> bool:
-    """Whether a process is a fork of the server: its command names the socket, and its folder is where it was asked."""
+    """Whether a process is a fork of the server, by the socket in its command and by its folder."""
     try:
         command = (process / "cmdline").read_text()
         return "serve" in command and warm[SOCKET] in command and (process / "cwd").readlink() != Path.cwd()
@@ -113,25 +113,25 @@ def socket_of(process: Path, warm: dict[str, str]) -> bool:
         return False
 
 
-def test_a_stage_has_one_thread_of_blas_whatever_the_user_set() -> None:
+def test_a_stage_has_one_blas_thread_whatever_the_environment() -> None:
     code = (
         "import os; from pipelines.warm import ENVIRONMENT; os.environ.update(ENVIRONMENT)\n"
         "import numpy, scipy.linalg; from threadpoolctl import threadpool_info\n"
         "print([pool['num_threads'] for pool in threadpool_info() if pool['user_api'] == 'blas'])"
     )
-    told = {**os.environ, "OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2"}
-    done = subprocess.run([sys.executable, "-c", code], env=told, capture_output=True, text=True, check=True)
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert set(json.loads(done.stdout)) == {1}
 
 
-def test_without_a_warm_process_a_stage_runs_by_itself(monkeypatch, tmp_path: Path) -> None:
+def test_without_a_warm_process_a_stage_runs_in_a_new_process(monkeypatch, tmp_path: Path) -> None:
     assert run_warm("act", []) is None
     monkeypatch.setenv(SOCKET, str(tmp_path / "none"))
     assert run_warm("act", []) is None
 
 
 needs_avx2 = pytest.mark.skipif(not same_kernels(), reason="this processor has no AVX2")
-# Sums of BLAS and a function of NumPy's own, both of which have one code per generation of processors.
+# A BLAS sum and a NumPy function, which both have different kernels per processor generation.
 COMPUTE = """
 import hashlib, numpy
 rows = numpy.random.default_rng(0).normal(size=(300, 300))
@@ -145,7 +145,7 @@ from hoidata.__main__ import main
 pipelines.cli.main = lambda: exec({COMPUTE!r})
 main()""",
 }
-# As older and newer processors would have it; the names are OpenBLAS's and NumPy's own.
+# Kernels of older and newer processors, with the names that OpenBLAS and NumPy use.
 PROCESSORS = (
     {"OPENBLAS_CORETYPE": "Sandybridge", "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR"},
     {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR"},
@@ -153,25 +153,25 @@ PROCESSORS = (
 )
 
 
-def said(code: str, environment: dict[str, str]) -> str:
-    told = {**os.environ, **environment}
+def output_of(code: str, environment: dict[str, str]) -> str:
+    variables = {**os.environ, **environment}
     call = [sys.executable, "-c", code]
-    return subprocess.run(call, env=told, capture_output=True, text=True, check=True, timeout=120).stdout
+    return subprocess.run(call, env=variables, capture_output=True, text=True, check=True, timeout=120).stdout
 
 
 @needs_avx2
-def test_without_it_the_bits_depend_on_the_processor() -> None:
-    assert len({said(COMPUTE, environment) for environment in PROCESSORS}) > 1
+def test_without_the_setting_the_bits_depend_on_the_processor() -> None:
+    assert len({output_of(COMPUTE, environment) for environment in PROCESSORS}) > 1
 
 
 @needs_avx2
 @pytest.mark.parametrize("door", DOORS)
-def test_a_stage_and_the_command_have_one_arithmetic(door: str) -> None:
-    assert len({said(DOORS[door], environment) for environment in PROCESSORS}) == 1
+def test_a_stage_and_the_command_use_the_same_kernels(door: str) -> None:
+    assert len({output_of(DOORS[door], environment) for environment in PROCESSORS}) == 1
 
 
 @needs_avx2
-def test_a_warm_stage_and_its_workers_have_the_same(monkeypatch, tmp_path: Path) -> None:
+def test_a_warm_stage_and_its_workers_use_the_same_kernels(monkeypatch, tmp_path: Path) -> None:
     act = f"import subprocess, sys\nexec({COMPUTE!r})\nsys.stdout.flush()\n"
     (tmp_path / "act.py").write_text(f"{act}subprocess.run([sys.executable, '-c', {COMPUTE!r}])")
     for key, value in PROCESSORS[1].items():
@@ -182,13 +182,13 @@ def test_a_warm_stage_and_its_workers_have_the_same(monkeypatch, tmp_path: Path)
         environment = {**warm.environment, "PYTHONPATH": os.pathsep.join((str(tmp_path), os.getcwd()))}
         ask = "import sys, time; from pathlib import Path; from pipelines.warm import run_warm\n"
         ask += f"while not Path({environment[SOCKET]!r}).exists(): time.sleep(0.02)\nsys.exit(run_warm('act', []))"
-        lines = said(ask, environment).splitlines()
+        lines = output_of(ask, environment).splitlines()
     finally:
         warm.close()
-    assert lines == [said(DOORS["stage"], {}).strip()] * 2
+    assert lines == [output_of(DOORS["stage"], {}).strip()] * 2
 
 
-def test_a_processor_without_avx2_and_another_system_are_left_alone(monkeypatch, tmp_path: Path) -> None:
+def test_kernels_are_not_set_without_avx2_or_on_another_system(monkeypatch, tmp_path: Path) -> None:
     (tmp_path / "cpuinfo").write_text("processor: 0\nflags\t\t: fpu sse sse4_2 avx\n")
     monkeypatch.setattr(processor, "_CPUINFO", tmp_path / "cpuinfo")
     assert same_kernels() == {}
@@ -196,7 +196,7 @@ def test_a_processor_without_avx2_and_another_system_are_left_alone(monkeypatch,
     assert same_kernels() == {}
 
 
-def test_the_processor_is_named_as_the_system_names_it(monkeypatch, tmp_path: Path) -> None:
+def test_the_processor_name_is_that_of_the_system(monkeypatch, tmp_path: Path) -> None:
     (tmp_path / "cpuinfo").write_text("processor: 0\nmodel name\t: A: fast one\n\nmodel name\t: another\n")
     monkeypatch.setattr(processor, "_CPUINFO", tmp_path / "cpuinfo")
     assert processor_name() == "A: fast one"

@@ -1,4 +1,4 @@
-"""What works where there is no project, and how one is made."""
+"""Commands outside of a project, and `hoidata init`."""
 
 import filecmp
 import subprocess
@@ -31,12 +31,12 @@ def test_importing_hoidata_loads_nothing_else():
     assert loaded("import hoidata") == {"hoidata"}
 
 
-def test_the_list_of_commands_comes_without_the_libraries_they_need():
+def test_help_does_not_import_the_libraries_of_the_commands():
     assert not HEAVY & loaded("import pipelines.cli")
 
 
-def test_init_makes_the_graph_of_the_clone_with_the_stages_of_the_installation(tmp_path):
-    assert "a project" in typed("init", tmp_path / "mine")
+def test_init_writes_the_graph_with_the_stage_command_of_the_installation(tmp_path):
+    assert "new project" in typed("init", tmp_path / "mine")
     assert list(written_graph(tmp_path / "mine")) == list(written_graph(PROJECT))
     assert read_params(tmp_path / "mine")["profile"] == "embedded"
     commands = "".join(path.read_text() for path in (tmp_path / "mine").rglob("dvc.yaml"))
@@ -45,7 +45,7 @@ def test_init_makes_the_graph_of_the_clone_with_the_stages_of_the_installation(t
     assert "analytics = false" in (tmp_path / "mine/.dvc/config").read_text()
 
 
-def test_init_leaves_a_project_alone_and_adds_to_what_git_ignores(tmp_path):
+def test_init_refuses_an_existing_project_and_appends_to_gitignore(tmp_path):
     (tmp_path / ".gitignore").write_text("mine\n")
     typed("init", tmp_path)
     assert (tmp_path / ".gitignore").read_text() == f"mine\n{(PROJECT / '.gitignore').read_text()}"
@@ -54,25 +54,27 @@ def test_init_leaves_a_project_alone_and_adds_to_what_git_ignores(tmp_path):
 
 
 @pytest.mark.slow
-def test_convert_gives_the_bytes_of_the_stage(tmp_path, monkeypatch, small_corpus):
+def test_convert_gives_the_same_bytes_as_the_stage(tmp_path, monkeypatch, small_corpus):
     monkeypatch.chdir(tmp_path)
     corpus = small_corpus("grab")
     words = ("convert", "grab", "--root", corpus.raw, "--out", "store", "--synthetic", "--jobs", 1)
     assert str(tmp_path / "store") in typed(*words)
     files = [path.relative_to(corpus.clips) for path in corpus.clips.rglob("*") if path.is_file()]
     assert filecmp.cmpfiles(corpus.clips, "store", files, shallow=False)[1:] == ([], [])
-    with pytest.raises(BadInput, match="not there yet"):
+    with pytest.raises(BadInput, match="a path that does not exist"):
         typed(*words)
 
 
-def test_convert_asks_for_the_hand_that_real_files_need(tmp_path, monkeypatch, small_corpus):
+def test_convert_requires_the_hand_model_that_real_files_need(tmp_path, monkeypatch, small_corpus):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HOIDATA_MANO", raising=False)
     with pytest.raises(MissingResource, match="--hand FOLDER"):
         typed("convert", "grab", "--root", small_corpus("grab").raw, "--out", tmp_path / "store")
 
 
-def test_show_draws_a_clip_of_a_bare_store_and_names_those_there_are(tmp_path, monkeypatch, small_corpus):
+def test_show_writes_a_page_of_a_clip_in_a_store_and_lists_the_clips_for_an_unknown_id(
+    tmp_path, monkeypatch, small_corpus
+):
     monkeypatch.chdir(tmp_path)
     store = small_corpus("grab").clips
     with pytest.raises(BadInput, match="name one, such as grab/") as error:

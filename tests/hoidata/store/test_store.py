@@ -29,7 +29,7 @@ from hoidata.store.store import open_store, write_store
 from hoidata.store_check.check import check_store
 from hoidata.store_check.describe import readme
 from pipelines.cli import app
-from pipelines.commands.store_facts import fact_rows, group_rows, left_out_rows
+from pipelines.commands.store_facts import fact_rows, group_rows, quarantine_rows
 from tests.builders.stores import write_clips
 
 
@@ -275,16 +275,17 @@ def test_the_facts_are_those_of_the_store(folder):
     assert facts["valid frames"] == "left 96.7 %, right 100.0 %"
     assert facts["world frame"] == "right-handed, up +z; z up, metres"
     assert (
-        "cameras in 2 clips; body parameters in 2 clips; contact labels of the source in 2 clips" in facts["also there"]
+        "cameras in 2 clips; body parameters in 2 clips; contact labels of the source in 2 clips"
+        in facts["optional data"]
     )
-    assert "hands fitted to keypoints in 1 clips" in facts["also there"]
+    assert "hands fitted to keypoints in 1 clips" in facts["optional data"]
 
 
 def test_clips_are_counted_by_object_and_verb(folder):
     store = open_store(folder)
     assert group_rows(store, "object") == [("box", "2", "50"), ("hinged_box", "1", "40")]
     assert group_rows(store, "verb") == [("lift", "2", "50"), ("(no label)", "1", "40")]
-    assert left_out_rows(store) == [("test/s9/bad_1", "bad_1.npz", "7 columns", "6")]
+    assert quarantine_rows(store) == [("test/s9/bad_1", "bad_1.npz", "7 columns", "6")]
 
 
 def test_the_command_prints_them_and_all_on_request(tmp_path, clips, monkeypatch):

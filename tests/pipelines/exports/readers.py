@@ -1,7 +1,7 @@
-"""Each export read back without hoidata's writers: by the target's own library, else after its documentation.
+"""Readers of the export formats that do not use hoidata's writers: the target's library, else code after its docs.
 
-A reader takes the exported folder and gives, by clip, (left joints, right joints, world_from_object): (frame, 21, 3),
-(frame, 21, 3) and (frame, 4, 4), in the clip's world; None for joints the format does not carry.
+A reader takes the exported folder and returns, by clip id, the left joints (frame, 21, 3), the right joints
+(frame, 21, 3) and world_from_object (frame, 4, 4), in metres in the clip's world.
 """
 
 import json
@@ -20,65 +20,65 @@ Read = dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 def export_all(store: Store, root: Path) -> dict[str, Path]:
-    """Every format, written once."""
+    """Export a store in all formats, and return the folders by format."""
     for name in FORMATS:
         export_store(store, name, root / name, progress=False)
     return {name: root / name for name in FORMATS}
 
 
 def read(name: str, folder: Path, cache: Path) -> Read:
-    """The export of a format by its reader."""
+    """Read an export with the reader of its format."""
     reader = globals()[name]
     return reader(folder, cache) if name == "huggingface" else reader(folder)
 
 
-def transforms(places: Any, quaternions_xyzw: Any) -> np.ndarray:
-    found = np.tile(np.eye(4), (len(places), 1, 1))
-    found[:, :3, :3], found[:, :3, 3] = Rotation.from_quat(quaternions_xyzw).as_matrix(), places
-    return found
+def transforms(positions: Any, quaternions_xyzw: Any) -> np.ndarray:
+    matrices = np.tile(np.eye(4), (len(positions), 1, 1))
+    matrices[:, :3, :3], matrices[:, :3, 3] = Rotation.from_quat(quaternions_xyzw).as_matrix(), positions
+    return matrices
 
 
 def lerobot(folder: Path) -> Read:
-    """After "LeRobotDataset v3.0" of huggingface/lerobot: info.json names the files, meta/episodes the rows in them."""
+    """As in "LeRobotDataset v3.0" of huggingface/lerobot: info.json has the files, meta/episodes the rows in them."""
     info = json.loads((folder / "meta" / "info.json").read_text())
     assert info["codebase_version"] == "v3.0"
-    found = {}
+    clips = {}
     for episode in pd.read_parquet(folder / "meta" / "episodes").to_dict("records"):
-        where = {"chunk_index": episode["data/chunk_index"], "file_index": episode["data/file_index"]}
-        frames = pd.read_parquet(folder / info["data_path"].format(**where))
+        file_indices = {"chunk_index": episode["data/chunk_index"], "file_index": episode["data/file_index"]}
+        frames = pd.read_parquet(folder / info["data_path"].format(**file_indices))
         frames = frames[frames["episode_index"] == episode["episode_index"]]
         assert frames["index"].tolist() == list(range(episode["dataset_from_index"], episode["dataset_to_index"]))
         state, pose = (np.stack(list(frames[f"observation.{name}"])) for name in ("state", "environment_state"))
         for name, values in (("observation.state", state), ("observation.environment_state", pose)):
             assert info["features"][name]["shape"] == [values.shape[1]] == [len(info["features"][name]["names"])]
         joints = state.reshape(-1, 2, 21, 3)
-        found[episode["clip_id"]] = (joints[:, 0], joints[:, 1], transforms(pose[:, :3], pose[:, 3:7]))
-    return found
+        clips[episode["clip_id"]] = (joints[:, 0], joints[:, 1], transforms(pose[:, :3], pose[:, 3:7]))
+    return clips
 
 
 def huggingface(folder: Path, cache: Path) -> Read:
     import datasets
 
     loaded = datasets.load_dataset(str(folder), cache_dir=str(cache))
-    rows = [row for split in loaded.values() for row in split.with_format("numpy")]
-    return {str(row["clip_id"]): _of_columns(row) for row in rows}
+    records = [record for split in loaded.values() for record in split.with_format("numpy")]
+    return {str(record["clip_id"]): _of_columns(record) for record in records}
 
 
 def webdataset(folder: Path) -> Read:
     from webdataset import autodecode, tariterators
 
-    found = {}
+    clips = {}
     for shard in folder.glob("*.tar"):
         with open(shard, "rb") as stream:  # WebDataset(shard) itself leaves the file open
             files = tariterators.tar_file_expander([{"url": str(shard), "stream": stream}])
             for sample in map(autodecode.Decoder([]), tariterators.group_by_keys(files)):
-                found[sample["json"]["clip_id"]] = _of_columns(sample["npz"])
-    return found
+                clips[sample["json"]["clip_id"]] = _of_columns(sample["npz"])
+    return clips
 
 
-def _of_columns(row: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    pose = transforms(np.asarray(row["object_translation_m"]), np.asarray(row["object_quaternion_xyzw"]))
-    return np.asarray(row["left_joints_m"]), np.asarray(row["right_joints_m"]), pose
+def _of_columns(record: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    pose = transforms(np.asarray(record["object_translation_m"]), np.asarray(record["object_quaternion_xyzw"]))
+    return np.asarray(record["left_joints_m"]), np.asarray(record["right_joints_m"]), pose
 
 
 def glb(folder: Path) -> Read:
@@ -124,18 +124,22 @@ def _of_usd(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def bvh(folder: Path) -> Read:
-    found = {}
+    clips = {}
     for clip in (path for path in folder.iterdir() if path.is_dir()):
         facts = json.loads((clip / "clip.json").read_text())
-        turned = {(0, -1, 0): 0, (0, 0, -1): 90}[tuple(facts["gravity"])]  # degrees about x, from y up to the clip's up
-        back = transforms(np.zeros((1, 3)), Rotation.from_euler("x", [turned], degrees=True).as_quat())
-        left, right, thing = (back[0] @ _of_bvh(clip / f"{name}.bvh") for name in ("left", "right", "object"))
-        found[facts["clip_id"]] = (left[:, :, :3, 3], right[:, :, :3, 3], thing[:, 0])
-    return found
+        angle_deg = {(0, -1, 0): 0, (0, 0, -1): 90}[
+            tuple(facts["gravity"])
+        ]  # degrees about x, from y up to the clip's up axis
+        world_from_file = transforms(np.zeros((1, 3)), Rotation.from_euler("x", [angle_deg], degrees=True).as_quat())
+        left, right, object_poses = (
+            world_from_file[0] @ _of_bvh(clip / f"{name}.bvh") for name in ("left", "right", "object")
+        )
+        clips[facts["clip_id"]] = (left[:, :, :3, 3], right[:, :, :3, 3], object_poses[:, 0])
+    return clips
 
 
 def _of_bvh(path: Path) -> np.ndarray:
-    """(frame, joint, 4, 4) in the file's order, after the format's description: the channels of each joint in turn."""
+    """World transforms (frame, joint, 4, 4) in the file's order, from the channels of each joint."""
     header, motion = path.read_text().split("MOTION")
     names, parents, channels, open_joints = [], [], [], []
     for words in map(str.split, header.splitlines()):
@@ -151,14 +155,14 @@ def _of_bvh(path: Path) -> np.ndarray:
             open_joints.pop()
         elif words[0] == "CHANNELS":
             channels.append(words[2:])
-    rows = np.loadtxt(motion.strip().splitlines()[2:], ndmin=2).reshape(-1, len(names), 6)
-    placed: list[np.ndarray] = []
+    channel_values = np.loadtxt(motion.strip().splitlines()[2:], ndmin=2).reshape(-1, len(names), 6)
+    world_transforms: list[np.ndarray] = []
     for joint, parent in enumerate(parents):
         order = "".join(name[0] for name in channels[joint][3:])
-        turn = Rotation.from_euler(order, rows[:, joint, 3:], degrees=True)
-        own = transforms(rows[:, joint, :3], turn.as_quat())
-        placed.append(own if parent < 0 else placed[parent] @ own)
-    by_name = dict(zip(names, placed, strict=True))
+        rotation = Rotation.from_euler(order, channel_values[:, joint, 3:], degrees=True)
+        local = transforms(channel_values[:, joint, :3], rotation.as_quat())
+        world_transforms.append(local if parent < 0 else world_transforms[parent] @ local)
+    by_name = dict(zip(names, world_transforms, strict=True))
     from hoidata.hands import JOINT_NAMES
 
     return np.stack([by_name[name] for name in (JOINT_NAMES if "wrist" in names else names)], axis=1)

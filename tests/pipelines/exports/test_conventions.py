@@ -1,4 +1,4 @@
-"""What an export's numbers are relative to, which of them are data, and labels of files that are not to be trusted."""
+"""Conventions of the exports, placeholders of untracked hands, and hostile labels."""
 
 import dataclasses
 import json
@@ -29,7 +29,7 @@ EVIL = "<img src=x onerror=alert(1)> [link](javascript:alert(1)) | a\n\n# headin
 
 
 def personal(clip: Clip) -> Clip:
-    """The clip of a person whose own rest mesh is the whole shape, as GRAB has it."""
+    """The clip with a personal rest mesh and zero shape coefficients, as in GRAB."""
     for side in SIDES:
         template_m = (HANDS[side].template_m * 1.1).astype(np.float32)
         clip = with_hand(clip, side, template_m=template_m, betas=np.zeros((1, 10), np.float32))
@@ -37,7 +37,7 @@ def personal(clip: Clip) -> Clip:
 
 
 def late_left(clip: Clip) -> Clip:
-    """The clip with a left hand that is tracked in frames 2 and 4 alone; elsewhere are the zeros of an adapter."""
+    """The clip with a left hand that is tracked in frames 2 and 4 only, and has zeros elsewhere."""
     valid = np.isin(np.arange(clip.n_frames), (2, 4))
     track = clip.hands["left"]
     zeros = {name: np.where(valid[:, None], getattr(track, name), 0) for name in ("wrist_m", "hand_pose")}
@@ -47,7 +47,7 @@ def late_left(clip: Clip) -> Clip:
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory) -> Store:
-    """A person with rest meshes, a left hand tracked late, a hand never tracked, and gravity that is not known."""
+    """A store with personal rest meshes, a left hand tracked late, a hand never tracked, and unknown gravity."""
     hinged = build_clip(5, "both", articulated=True, seed=2, clip_id="toy/s2/open")
     absent = with_hand(build_clip(3, "right", seed=3, clip_id="toy/s3/lift"), "left", valid=np.zeros(3, bool))
     unknown = dataclasses.replace(absent, clip_id="toy/s3/float", gravity=None, gravity_note="nothing says it")
@@ -63,18 +63,22 @@ def exported(store, tmp_path_factory) -> dict[str, Path]:
 
 
 def rows_of(folder: Path) -> dict[str, dict[str, Any]]:
-    return {row["clip_id"]: row for path in folder.glob("data/*.parquet") for row in pq.read_table(path).to_pylist()}
+    return {
+        record["clip_id"]: record
+        for path in folder.glob("data/*.parquet")
+        for record in pq.read_table(path).to_pylist()
+    }
 
 
 def feature_types(feature: Any) -> set[str]:
-    """Every ``_type`` in the features of a schema."""
+    """All values of ``_type`` in the features of a schema."""
     if not isinstance(feature, dict):
         return set()
-    found = {feature["_type"]} if "_type" in feature else set()
-    return found.union(*map(feature_types, feature.values()))
+    types = {feature["_type"]} if "_type" in feature else set()
+    return types.union(*map(feature_types, feature.values()))
 
 
-def test_the_features_are_those_that_datasets_3_knows(exported):
+def test_the_features_are_those_that_datasets_3_supports(exported):
     (path,) = exported["huggingface"].glob("data/*.parquet")
     features = json.loads(pq.read_schema(path).metadata[b"huggingface"])["info"]["features"]
     assert feature_types(features) == {"Value", "Sequence"}  # "List" came with datasets 4
@@ -82,7 +86,7 @@ def test_the_features_are_those_that_datasets_3_knows(exported):
     assert set(features) == set(pq.read_schema(path).names)
 
 
-def test_the_versions_that_opened_the_exports_are_named():
+def test_the_docs_name_the_tested_versions():
     page = (Path(__file__).parents[3] / "docs" / "export.md").read_text()
     tested = page.split("## Tested with")[1].split("## ")[0]
     for name in ("datasets", "lerobot", "webdataset", "mlcroissant", "usd-core", "Blender"):
@@ -101,16 +105,16 @@ def test_a_hand_is_rebuilt_from_a_row_with_its_rest_mesh(store, exported):
         template_m, betas = np.array(row[f"{side}_template_m"]), np.array(row[f"{side}_betas"])
         assert np.isnan(betas).all()  # zeros would be read as MANO's mean hand
         no_betas, valid = np.zeros((1, 10)), np.ones(len(joints), bool)
-        own = HandTrack(joints[:, 0], orient, pose, no_betas, valid, template_m)
-        assert np.abs(track_joints(own, HANDS[side]) - joints).max() < 1e-5
-        mean_hand = dataclasses.replace(own, template_m=None)
+        rebuilt = HandTrack(joints[:, 0], orient, pose, no_betas, valid=valid, template_m=template_m)
+        assert np.abs(track_joints(rebuilt, HANDS[side]) - joints).max() < 1e-5
+        mean_hand = dataclasses.replace(rebuilt, template_m=None)
         assert np.abs(track_joints(mean_hand, HANDS[side]) - joints).max() > 0.002
     others = rows_of(exported["huggingface"])["toy/s2/open"]
     assert others["right_template_m"] == []
     assert np.allclose(others["right_betas"], store.clip("toy/s2/open").hands["right"].betas)
 
 
-def test_cards_say_what_every_array_is_relative_to(exported):
+def test_cards_state_the_meaning_and_frame_of_all_arrays(exported):
     for name in ("huggingface", "webdataset", "lerobot"):
         card = (exported[name] / "README.md").read_text()
         assert all(f"| {column.name} |" in card and column.meaning in card for column in FORMATS[name].columns), name
@@ -124,7 +128,7 @@ def test_cards_say_what_every_array_is_relative_to(exported):
     assert "radian" in fields["left_hand_pose"]["description"]
 
 
-def test_every_format_has_gravity_and_says_where_it_is_not_known(store, exported):
+def test_all_formats_have_gravity_and_mark_unknown_gravity(store, exported):
     from pxr import Usd
 
     rows = rows_of(exported["huggingface"])
@@ -141,14 +145,14 @@ def test_every_format_has_gravity_and_says_where_it_is_not_known(store, exported
         assert scene.asset.extras.get("gravity") == gravity  # glTF drops null
         stage: Any = Usd.Stage.Open(str(exported["usd"] / f"{name}.usdc"))
         assert json.loads(stage.GetDefaultPrim().GetCustomData()["facts"])["gravity"] == gravity
-    # SPIDER simulates: without gravity there is no z that is up.
+    # SPIDER simulates: without gravity the z axis is not defined.
     left_out = json.loads((exported["spider"] / "export.json").read_text())["left_out"]
     assert "gravity" in left_out["toy/s3/float"]
     assert "toy/s3/lift" not in left_out
 
 
-def test_bvh_is_upright_where_an_importer_takes_y_for_up(store, exported):
-    """Blender's import by default: BVH's y becomes Blender's z, its -z Blender's y."""
+def test_bvh_is_upright_in_an_importer_that_assumes_y_up(store, exported):
+    """Blender's default import: y becomes z, and -z becomes y."""
     folder = exported["bvh"] / "toy__s1__lift"
     for side in SIDES:
         x, y, z = np.moveaxis(readers._of_bvh(folder / f"{side}.bvh")[:, :, :3, 3], -1, 0)
@@ -158,7 +162,7 @@ def test_bvh_is_upright_where_an_importer_takes_y_for_up(store, exported):
 
 
 @pytest.mark.parametrize("name", ["lerobot", "huggingface", "webdataset", "glb", "usd"])
-def test_a_hand_holds_its_last_tracked_pose_in_every_format(name, store, exported, tmp_path):
+def test_a_hand_repeats_its_last_tracked_pose_in_all_formats(name, store, exported, tmp_path):
     only = tmp_path / "one"
     export_store(store, name, only, clip_ids=("toy/s2/open",), progress=False)
     left, right, _ = readers.read(name, only, tmp_path / "cache")["toy/s2/open"]
@@ -166,7 +170,7 @@ def test_a_hand_holds_its_last_tracked_pose_in_every_format(name, store, exporte
     assert np.abs(right - store.joints("toy/s2/open", "right")).max() < 1e-4
 
 
-def test_bvh_says_in_which_frames_a_pose_is_repeated(store, exported):
+def test_bvh_lists_the_frames_in_which_a_pose_is_repeated(store, exported):
     folder = exported["bvh"] / "toy__s2__open"
     facts = json.loads((folder / "clip.json").read_text())
     assert facts["untracked_frames"] == {"left": [[0, 2], [3, 4]], "right": []}
@@ -175,7 +179,7 @@ def test_bvh_says_in_which_frames_a_pose_is_repeated(store, exported):
     assert not (exported["bvh"] / "toy__s3__lift" / "left.bvh").exists()
 
 
-def test_lerobot_counts_no_place_holder_in_its_statistics(store, exported):
+def test_lerobot_statistics_exclude_placeholders(store, exported):
     folder = exported["lerobot"]
     statistics = json.loads((folder / "meta/stats.json").read_text())
     frames = pd.read_parquet(folder / "data")
@@ -186,16 +190,16 @@ def test_lerobot_counts_no_place_holder_in_its_statistics(store, exported):
     assert (following == np.concatenate([valid[1:], valid[:1]]) & ~last[:, None]).all()
     for name, values, mask in (("observation.state", state, valid), ("action", action, following)):
         expected = [values[mask[:, side], 63 * side : 63 * side + 63].astype(np.float64) for side in (0, 1)]
-        for key, of in (("mean", np.mean), ("std", np.std), ("min", np.min), ("max", np.max)):
-            found = np.concatenate([of(own, axis=0) for own in expected])
-            assert statistics[name][key] == pytest.approx(found, abs=1e-6), (name, key)
+        for key, reduce in (("mean", np.mean), ("std", np.std), ("min", np.min), ("max", np.max)):
+            computed = np.concatenate([reduce(joints, axis=0) for joints in expected])
+            assert statistics[name][key] == pytest.approx(computed, abs=1e-6), (name, key)
     hinge = store.clip("toy/s2/open").object.hinge_rad
     assert hinge is not None
     assert statistics["observation.environment_state"]["mean"][7] == pytest.approx(hinge.mean())  # not of rigid objects
     assert statistics["observation.environment_state"]["min"][7] == pytest.approx(hinge.min())
 
 
-def test_an_episode_without_a_hand_leaves_merged_statistics_as_they_are(store, exported):
+def test_an_episode_without_a_hand_does_not_change_merged_statistics(store, exported):
     episodes = pd.read_parquet(exported["lerobot"] / "meta/episodes").set_index("clip_id")
     total = json.loads((exported["lerobot"] / "meta/stats.json").read_text())["observation.state"]
     absent = episodes.loc["toy/s3/lift"]
@@ -204,7 +208,7 @@ def test_an_episode_without_a_hand_leaves_merged_statistics_as_they_are(store, e
     assert absent["stats/observation.state/count"].tolist() == [3]
 
 
-def test_labels_are_text_in_a_card_and_do_not_leave_it(tmp_path):
+def test_hostile_labels_are_plain_text_in_a_card(tmp_path):
     clip = dataclasses.replace(build_clip(3), verb=EVIL, object_words=EVIL, subject=EVIL, clip_id=f"toy/{EVIL}")
     info = generated_info("toy") | {"licence": EVIL, "dataset": f"{EVIL}\n---", "where_to_register": EVIL}
     info["frame"] = info["frame"] | {"note": EVIL}
@@ -226,7 +230,7 @@ def _tokens(text: str) -> list[Any]:
     return [token for block in blocks for token in (block, *(block.children or ()))]
 
 
-def test_names_of_files_are_different_for_different_labels_and_stay_in_their_folder():
+def test_different_labels_give_different_file_names_in_the_same_folder():
     labels = [
         "a/b__c",
         "a/b/c",
@@ -251,7 +255,7 @@ def test_names_of_files_are_different_for_different_labels_and_stay_in_their_fol
     assert file_name_of("grab/s10/apple_eat_1") == "grab__s10__apple_eat_1"
 
 
-def test_an_object_whose_name_is_a_path_stays_in_the_folder_of_the_export(tmp_path):
+def test_an_object_with_a_path_as_name_stays_in_the_folder_of_the_export(tmp_path):
     clip = build_clip(3, "both")
     model = dataclasses.replace(clip.object.model, name="../../../../outside")
     clip = dataclasses.replace(clip, object=dataclasses.replace(clip.object, model=model))

@@ -1,4 +1,4 @@
-"""Exports: what was in the clip is in what others read, and nothing is passed on that may not be."""
+"""Exports keep the content of the clips, and refuse data whose licence forbids sharing."""
 
 import dataclasses
 import json
@@ -35,7 +35,7 @@ GRAB = "GRAB licence (MPI): non-commercial research, no redistribution"
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory) -> Store:
-    """A rigid and a hinged object, a personal hand, betas per frame, gravity along y, frames without a hand."""
+    """A store with a rigid and a hinged object, a personal hand, betas per frame, gravity along y, untracked frames."""
     rigid = build_clip(5, "both", seed=1, clip_id="toy/s1/lift_1", gravity=(0.0, -1.0, 0.0))
     template = load_embedded_hands().right.template_m.astype(np.float32) * np.float32(1.1)
     rigid = with_hand(rigid, "right", template_m=template)
@@ -52,10 +52,10 @@ def exported(store, tmp_path_factory) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize("name", READ_BACK)
-def test_joints_and_object_come_back_from_every_format(name, store, exported, tmp_path):
-    found = readers.read(name, exported[name], tmp_path)
-    assert set(found) == set(store.ids)
-    for clip_id, (left, right, world_from_object) in found.items():
+def test_joints_and_object_pose_are_read_back_from_all_formats(name, store, exported, tmp_path):
+    clips = readers.read(name, exported[name], tmp_path)
+    assert set(clips) == set(store.ids)
+    for clip_id, (left, right, world_from_object) in clips.items():
         for side, joints in zip(SIDES, (left, right), strict=True):
             expected = store.joints(clip_id, side)
             if (clip_id, side) == ("toy/s2/open_1", "left"):
@@ -67,7 +67,7 @@ def test_joints_and_object_come_back_from_every_format(name, store, exported, tm
         assert np.abs(world_from_object[:, :3, :3] @ corner + world_from_object[:, :3, 3] - expected).max() <= TOLERANCE
 
 
-def test_spider_gets_tips_and_object_with_z_up_and_is_told_what_it_has_no_form_for(store, exported):
+def test_spider_gets_tips_and_object_with_z_up_and_skips_unsupported_clips(store, exported):
     folder = exported["spider"]
     (path,) = folder.rglob("trajectory_keypoints.npz")
     arrays, clip = np.load(path), store.clip("toy/s1/lift_1")
@@ -78,23 +78,28 @@ def test_spider_gets_tips_and_object_with_z_up_and_is_told_what_it_has_no_form_f
         assert np.abs(arrays[f"qpos_finger_{side}"][:, :, :3] - tips).max() <= TOLERANCE
         assert np.abs(arrays[f"qpos_wrist_{side}"][:, :3] - z_up.apply(joints[:, 0])).max() <= TOLERANCE
         to_middle = z_up.apply(joints[:, 4] - joints[:, 0])
-        along = Rotation.from_quat(arrays[f"qpos_wrist_{side}"][:, [4, 5, 6, 3]]).apply([0, 0, 1])
-        assert np.cross(along, to_middle) == pytest.approx(0, abs=1e-6)
+        wrist_z = Rotation.from_quat(arrays[f"qpos_wrist_{side}"][:, [4, 5, 6, 3]]).apply([0, 0, 1])
+        assert np.cross(wrist_z, to_middle) == pytest.approx(0, abs=1e-6)
     pose = arrays["qpos_obj_right"]
     assert np.abs(pose[:, :3] - z_up.apply(clip.object.translation_m)).max() <= TOLERANCE
-    turn = z_up * Rotation.from_rotvec(clip.object.rotvec)
-    assert (Rotation.from_quat(pose[:, [4, 5, 6, 3]]).inv() * turn).magnitude().max() < 1e-6
+    rotation = z_up * Rotation.from_rotvec(clip.object.rotvec)
+    assert (Rotation.from_quat(pose[:, [4, 5, 6, 3]]).inv() * rotation).magnitude().max() < 1e-6
     info = json.loads((path.parents[1] / "task_info.json").read_text())
     assert (folder / info["right_object_mesh_dir"] / "visual.obj").is_file()
     assert "hinge" in json.loads((folder / "export.json").read_text())["left_out"]["toy/s2/open_1"]
 
 
-def test_a_hand_that_is_not_tracked_is_not_seen_in_usd(exported):
+def test_an_untracked_hand_is_invisible_in_usd(exported):
     from pxr import Usd, UsdGeom
 
     stage: Any = Usd.Stage.Open(str(exported["usd"] / "toy__s2__open_1.usdc"))
-    seen = UsdGeom.Imageable(stage.GetPrimAtPath("/world/left_hand"))
-    assert [seen.ComputeVisibility(frame) for frame in range(4)] == ["inherited", "invisible", "inherited", "inherited"]
+    imageable = UsdGeom.Imageable(stage.GetPrimAtPath("/world/left_hand"))
+    assert [imageable.ComputeVisibility(frame) for frame in range(4)] == [
+        "inherited",
+        "invisible",
+        "inherited",
+        "inherited",
+    ]
 
 
 def test_lerobot_tasks_are_the_sentences_and_splits_are_ranges_of_episodes(store, exported):
@@ -102,16 +107,16 @@ def test_lerobot_tasks_are_the_sentences_and_splits_are_ranges_of_episodes(store
 
     folder = exported["lerobot"]
     tasks = pd.read_parquet(folder / "meta" / "tasks.parquet")
-    said = pd.read_parquet(store.folder.parent / "annotation" / "text.parquet")["sentence"]
-    assert set(tasks.index) == set(said)
+    sentences = pd.read_parquet(store.folder.parent / "annotation" / "text.parquet")["sentence"]
+    assert set(tasks.index) == set(sentences)
     info = json.loads((folder / "meta" / "info.json").read_text())
     assert info["splits"] == {"train": "0:1", "validation": "1:2"}
     stats = json.loads((folder / "meta" / "stats.json").read_text())
     tracked = [store.clip(clip_id).hands["left"].valid for clip_id in store.ids]
     left = np.concatenate([store.joints(clip_id, "left") for clip_id in store.ids])[np.concatenate(tracked)]
     right = np.concatenate([store.joints(clip_id, "right") for clip_id in store.ids])
-    for name, of in (("mean", np.mean), ("std", np.std), ("min", np.min), ("max", np.max)):
-        expected = np.concatenate([of(joints.astype(np.float64), axis=0).ravel() for joints in (left, right)])
+    for name, reduce in (("mean", np.mean), ("std", np.std), ("min", np.min), ("max", np.max)):
+        expected = np.concatenate([reduce(joints.astype(np.float64), axis=0).ravel() for joints in (left, right)])
         assert stats["observation.state"][name] == pytest.approx(expected, abs=1e-6)
     assert stats["observation.state"]["count"] == [9]
 
@@ -146,7 +151,7 @@ def test_croissant_is_valid_and_reads_the_tables(name, store, exported, tmp_path
 def test_the_card_names_licence_and_files(exported):
     _, front, text = (exported["huggingface"] / "README.md").read_text().split("---\n", 2)
     facts = yaml.safe_load(front)
-    assert facts["license"] == "other"  # "none: generated" is no SPDX licence
+    assert facts["license"] == "other"  # "none: generated" is not an SPDX licence
     files = [row["path"] for row in facts["configs"][0]["data_files"]]
     assert files
     assert all((exported["huggingface"] / path).is_file() for path in files)
@@ -173,27 +178,25 @@ def test_every_stored_array_has_one_licence():
         (GRAB, "LicenseRef-grab"),
     ],
 )
-def test_licences_are_known_by_their_spdx_ids(licence, spdx):
+def test_spdx_ids_of_licences(licence, spdx):
     assert spdx_of(licence, "grab") == spdx
 
 
-def bound_store(folder: Path, **facts: Any) -> Store:
-    """One clip under the facts of info.json given."""
+def store_with(folder: Path, **facts: Any) -> Store:
+    """A store of one clip with some facts of info.json replaced."""
     write_store(folder, [build_clip(3)], generated_info("grab") | facts)
     return open_store(folder)
 
 
 @pytest.mark.parametrize("name", [name for name in FORMATS if FORMATS[name].kinds])
-def test_what_may_not_be_passed_on_is_refused_with_the_licence(name, tmp_path):
-    bound = bound_store(tmp_path / "clips", licence=GRAB, may_be_shared=False)
-    with pytest.raises(
-        BadInput, match=r"no redistribution \(LicenseRef-grab\).*forbids passing this on.*--for-own-use"
-    ):
-        export_store(bound, name, tmp_path / "out", progress=False)
+def test_data_that_must_not_be_shared_is_refused_with_the_licence(name, tmp_path):
+    restricted = store_with(tmp_path / "clips", licence=GRAB, may_be_shared=False)
+    with pytest.raises(BadInput, match=r"no redistribution \(LicenseRef-grab\).*forbids sharing this.*--for-own-use"):
+        export_store(restricted, name, tmp_path / "out", progress=False)
     assert not (tmp_path / "out").exists()
 
 
-def test_rest_meshes_of_persons_are_bound_only_where_the_store_has_some(tmp_path):
+def test_the_licence_of_personal_rest_meshes_counts_only_if_the_store_has_some(tmp_path):
     free = {kind: {"licence": "CC BY 4.0", "may_be_shared": True} for kind in ("hands", "object motion", "words")}
     facts = generated_info("grab") | {"licence": GRAB, "may_be_shared": False, "licences": free}
     template = load_embedded_hands().right.template_m.astype(np.float32)
@@ -204,14 +207,14 @@ def test_rest_meshes_of_persons_are_bound_only_where_the_store_has_some(tmp_path
         export_store(open_store(tmp_path / "with"), "huggingface", tmp_path / "b", progress=False)
 
 
-def test_for_own_use_it_is_written_and_says_so(tmp_path):
-    bound = bound_store(tmp_path / "clips", licence=GRAB, may_be_shared=False)
-    export_store(bound, "huggingface", tmp_path / "out", for_own_use=True, progress=False)
+def test_an_export_for_own_use_is_written_and_marked(tmp_path):
+    restricted = store_with(tmp_path / "clips", licence=GRAB, may_be_shared=False)
+    export_store(restricted, "huggingface", tmp_path / "out", for_own_use=True, progress=False)
     for name in ("export.json", "croissant.json", "README.md"):
-        assert "not to be passed on" in (tmp_path / "out" / name).read_text(), name
+        assert "not to be shared" in (tmp_path / "out" / name).read_text(), name
 
 
-def test_the_mesh_of_mano_is_not_passed_on_even_where_the_data_may_be(store, tmp_path):
+def test_the_mano_mesh_is_not_shared_even_if_the_data_may_be(store, tmp_path):
     info = {**store.info, "licence": "CC BY 4.0", "hand_model": {"name": "mano", "digest": "0" * 64}}
     by_kind = {row.kind.name: row for row in licences_of(info)}
     assert by_kind["hands"].may_be_shared
@@ -220,28 +223,28 @@ def test_the_mesh_of_mano_is_not_passed_on_even_where_the_data_may_be(store, tmp
         export_store(dataclasses.replace(store, info=info), "usd", tmp_path / "out", progress=False)
 
 
-def test_the_command_writes_a_dataset_with_its_words_and_its_page_names_every_form(store, tmp_path):
-    asked = ["export", str(store.folder.parent), "--to", "webdataset", "--out", str(tmp_path / "a")]
-    found = CliRunner().invoke(app, asked)
-    assert found.exit_code == 0, found.output
+def test_the_command_writes_a_dataset_with_sentences_and_the_docs_list_all_formats(store, tmp_path):
+    arguments = ["export", str(store.folder.parent), "--to", "webdataset", "--out", str(tmp_path / "a")]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
     assert {path.name for path in (tmp_path / "a").glob("*.tar")} == {"train-000000.tar", "validation-000000.tar"}
     page = (Path(__file__).parents[3] / "docs" / "export.md").read_text()
     assert all(f"| `{name}` |" in page for name in FORMATS)
-    said = " ".join(CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "300"}).output.split())
-    assert f"{', '.join(list(FORMATS)[:-1])} or {list(FORMATS)[-1]}" in said
+    help_text = " ".join(CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "300"}).output.split())
+    assert f"{', '.join(list(FORMATS)[:-1])} or {list(FORMATS)[-1]}" in help_text
 
 
-def test_what_cannot_be_exported_is_answered(store, tmp_path):
+def test_unusable_arguments_are_refused(store, tmp_path):
     (tmp_path / "there").mkdir()
-    answers: list[tuple[str, dict[str, Any]]] = [
+    cases: list[tuple[str, dict[str, Any]]] = [
         ("one of croissant, lerobot", {"to": "fbx", "out": tmp_path / "a"}),
-        ("not there yet", {"to": "bvh", "out": tmp_path / "there"}),
+        ("a path that does not exist", {"to": "bvh", "out": tmp_path / "there"}),
         ("ids of clips", {"to": "bvh", "out": tmp_path / "a", "clip_ids": ("toy/s9/none",)}),
         ("has a hinge", {"to": "spider", "out": tmp_path / "a", "clip_ids": ("toy/s2/open_1",)}),
     ]
-    for words, asked in answers:
-        with pytest.raises(BadInput, match=words):
-            export_store(store, **asked, progress=False)
+    for message, arguments in cases:
+        with pytest.raises(BadInput, match=message):
+            export_store(store, **arguments, progress=False)
     write_store(tmp_path / "empty", [], generated_info("toy"))
     with pytest.raises(BadInput, match="a store with clips"):
         export_store(open_store(tmp_path / "empty"), "bvh", tmp_path / "a", progress=False)

@@ -1,4 +1,4 @@
-"""A project of a few stages after a run: real stores, checkpoints, dvc.lock and one commit; no network is trained."""
+"""A small project after a run, with real stores, checkpoints, dvc.lock and one commit; no network is trained."""
 
 import json
 import shutil
@@ -90,21 +90,21 @@ CODE = {
     "pipelines/stages/convert.py": "import hoidata.datasets.registry",
     "pipelines/stages/train.py": "from models.text2hoi import contact",
 }
-SEEN = {"contact": ("grab/s1/mug_lift", "grab/s1/cup_pour"), "length": ("grab/s2/mug_pass",)}
-ALL_CLIPS = (*SEEN["contact"], *SEEN["length"], "grab/s3/box_lift")
+TRAINING_CLIPS = {"contact": ("grab/s1/mug_lift", "grab/s1/cup_pour"), "length": ("grab/s2/mug_pass",)}
+ALL_CLIPS = (*TRAINING_CLIPS["contact"], *TRAINING_CLIPS["length"], "grab/s3/box_lift")
 
 
 def recorded_clip(clip_id: str):
     _, subject, sequence = clip_id.split("/")
-    thing = sequence.partition("_")[0]
-    files = (f"grab/{subject}/{sequence}.npz", f"tools/{thing}.ply")
+    object_name = sequence.partition("_")[0]
+    files = (f"grab/{subject}/{sequence}.npz", f"tools/{object_name}.ply")
     sources = tuple(SourceFile(name, len(name), sha256_bytes(name.encode())) for name in files)
-    model = replace(box_model(), name=thing)
+    model = replace(box_model(), name=object_name)
     return clip_of(clip_id, still_object(model, 3), sources=sources, source_frames=np.array([60, 64, 68], np.int32))
 
 
 def write_data(root: Path) -> None:
-    """The raw files as their names, their list, the store, a table, motions for the test clip, and a figure."""
+    """Write raw files that contain their names, their manifest, a store, a table, a sample and a metric file."""
     clips = [recorded_clip(clip_id) for clip_id in ALL_CLIPS]
     raw = {source.path: source for clip in clips for source in clip.sources}
     write_text(root, {f".hoidata/raw/embedded/grab/{path}": path for path in raw})
@@ -118,11 +118,11 @@ def write_data(root: Path) -> None:
 
 
 def train(root: Path, weights: float = 0.0, **facts: object) -> None:
-    """Write both checkpoints as the stage does, with the record of what lies at ``root``."""
-    for model, clips in SEEN.items():
-        known = {"model": model, "seed": read_params(root)["train"]["seed"], "clips": {"train": list(clips)}}
+    """Write both checkpoints as the stage does, with the provenance of the files at ``root``."""
+    for model, clips in TRAINING_CLIPS.items():
+        facts_of_stage = {"model": model, "seed": read_params(root)["train"]["seed"], "clips": {"train": list(clips)}}
         stage = f"models/text2hoi/dvc.yaml:train@embedded-grab-{model}"
-        provenance = build_provenance(root, stage, known | {"synthetic": True, "device": "cpu"} | facts)
+        provenance = build_provenance(root, stage, facts_of_stage | {"synthetic": True, "device": "cpu"} | facts)
         values = {"weight": np.full(4, weights, np.float32)}
         data = sealed(save(values, {"hoidata": canonical_json({"provenance": provenance, "seal": OPEN_SEAL})}))
         path = root / f"checkpoints/embedded/grab/{model}/model.safetensors"
@@ -131,15 +131,15 @@ def train(root: Path, weights: float = 0.0, **facts: object) -> None:
 
 
 def write_locks(root: Path) -> None:
-    """dvc.lock as DVC would leave it. That its MD5 are these is tested on a real run (test_repro)."""
+    """Write dvc.lock as DVC does; test_repro compares the digests with those of a real run."""
     params, files = read_params(root), {"dvc.lock": {}, "models/text2hoi/dvc.lock": {}}
 
     def entries(paths: tuple[str, ...]) -> list[dict]:
         return [{"path": path, "hash": "md5", "md5": dvc_digest(root / path)} for path in paths]
 
     def run(stage: Stage) -> dict:
-        read = {"params.yaml": {key: look_up(params, key) for key in stage.params}} if stage.params else {}
-        return {"cmd": "run", "deps": entries(stage.deps), "params": read, "outs": entries(stage.outs)}
+        params_read = {"params.yaml": {key: look_up(params, key) for key in stage.params}} if stage.params else {}
+        return {"cmd": "run", "deps": entries(stage.deps), "params": params_read, "outs": entries(stage.outs)}
 
     for stage in written_graph(root).values():
         file, _, name = stage.name.rpartition(":")
@@ -149,14 +149,14 @@ def write_locks(root: Path) -> None:
         (root / file).write_text(yaml.safe_dump(values, sort_keys=False))
 
 
-def git(root: Path, *words: str) -> str:
+def git(root: Path, *arguments: str) -> str:
     identity = ("-c", "user.name=t", "-c", "user.email=t@example.org", "-c", "commit.gpgsign=false")
-    return subprocess.run(["git", *identity, *words], cwd=root, check=True, capture_output=True, text=True).stdout
+    return subprocess.run(["git", *identity, *arguments], cwd=root, check=True, capture_output=True, text=True).stdout
 
 
-def commit(root: Path, words: str = "run") -> str:
+def commit(root: Path, message: str = "run") -> str:
     git(root, "add", "-A")
-    git(root, "commit", "--quiet", "-m", words)
+    git(root, "commit", "--quiet", "-m", message)
     return git(root, "rev-parse", "HEAD").strip()
 
 
@@ -183,21 +183,25 @@ def ran_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def ran(ran_once: Path, tmp_path: Path) -> SimpleNamespace:
-    """A project of one's own after a run, and what changes it."""
+    """A copy of the project after a run, and functions that change it."""
     root = Path(shutil.copytree(ran_once, tmp_path / "project"))
 
-    def again(**facts: object) -> None:
+    def run_again(**facts: object) -> None:
         write_code(root)
         train(root, **facts)
         write_locks(root)
 
-    def bound(function: Callable) -> Callable:
+    def with_root(function: Callable) -> Callable:
         return lambda *words, **named: function(root, *words, **named)
 
-    return SimpleNamespace(root=root, again=again, commit=bound(commit), git=bound(git), write=bound(write_text))
+    return SimpleNamespace(
+        root=root, run_again=run_again, commit=with_root(commit), git=with_root(git), write=with_root(write_text)
+    )
 
 
 @pytest.fixture
 def project_builder() -> SimpleNamespace:
-    """The functions above, for tests that need another project: test modules cannot import a conftest."""
-    return SimpleNamespace(build=build_project, code=CODE, clips=ALL_CLIPS, seen=SEEN, recorded_clip=recorded_clip)
+    """The functions above, for test modules, which cannot import a conftest."""
+    return SimpleNamespace(
+        build=build_project, code=CODE, clips=ALL_CLIPS, training_clips=TRAINING_CLIPS, recorded_clip=recorded_clip
+    )

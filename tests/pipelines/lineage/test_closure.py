@@ -1,4 +1,4 @@
-"""Which files the code behind a module is, on packages in a temporary folder."""
+"""The import closure of a module, on packages in a temporary folder."""
 
 import json
 from dataclasses import replace
@@ -9,30 +9,30 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.lineage.closure import KNOWN_IMPORTS, Choice, SourceTree
+from pipelines.lineage.closure import CACHED_IMPORTS, Choice, SourceTree
 from tests.builders.folders import write_text
 
 STAGE = """import numpy
 
 def run():
     try:
-        from hoidata.room import inside
+        from hoidata.kit import inside
     except OSError:
         pass
 """
 FILES = {
     "hoidata/__init__.py": "",
     "hoidata/stage.py": STAGE,
-    "hoidata/room/__init__.py": "from hoidata.room.shown import something",
-    "hoidata/room/inside.py": "from . import beside",
-    "hoidata/room/beside.py": "",
-    "hoidata/room/shown.py": "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import hoidata.typed\n",
-    "hoidata/room/unused.py": "import hoidata.typed",
-    "hoidata/room/words.csv": "",
-    "hoidata/room/assets/hand.npz": "",
-    "hoidata/room/README.md": "",
-    "hoidata/room/below/module.py": "",
-    "hoidata/room/below/table.csv": "",
+    "hoidata/kit/__init__.py": "from hoidata.kit.shown import something",
+    "hoidata/kit/inside.py": "from . import sibling",
+    "hoidata/kit/sibling.py": "",
+    "hoidata/kit/shown.py": "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import hoidata.typed\n",
+    "hoidata/kit/unused.py": "import hoidata.typed",
+    "hoidata/kit/words.csv": "",
+    "hoidata/kit/assets/hand.npz": "",
+    "hoidata/kit/README.md": "",
+    "hoidata/kit/below/module.py": "",
+    "hoidata/kit/below/table.csv": "",
     "hoidata/typed.py": "",
     "hoidata/registry.py": "",
     "hoidata/reader.py": "",
@@ -41,18 +41,18 @@ FILES = {
     "hoidata/datasets/grab/splits.json": "",
     "hoidata/datasets/h2o/adapter.py": "",
 }
-OF_STAGE = {
+STAGE_FILES = {
     "hoidata/__init__.py",
     "hoidata/stage.py",
-    "hoidata/room/__init__.py",
-    "hoidata/room/inside.py",
-    "hoidata/room/beside.py",
-    "hoidata/room/shown.py",
-    "hoidata/room/words.csv",
-    "hoidata/room/assets/hand.npz",
+    "hoidata/kit/__init__.py",
+    "hoidata/kit/inside.py",
+    "hoidata/kit/sibling.py",
+    "hoidata/kit/shown.py",
+    "hoidata/kit/words.csv",
+    "hoidata/kit/assets/hand.npz",
 }
-MODULES = ("hoidata/stage.py", "hoidata/room/__init__.py", "hoidata/room/inside.py", "hoidata/room/beside.py")
-IMPORTS = ("", "import hoidata.typed", "from hoidata.room import unused", "from . import beside")
+MODULES = ("hoidata/stage.py", "hoidata/kit/__init__.py", "hoidata/kit/inside.py", "hoidata/kit/sibling.py")
+IMPORTS = ("", "import hoidata.typed", "from hoidata.kit import unused", "from . import sibling")
 ADAPTER = Choice(modules=("hoidata.datasets.grab.adapter",))
 SPLITS = Choice(package="hoidata.datasets.grab", files=("*.json",))
 
@@ -62,48 +62,48 @@ def root(tmp_path: Path) -> Path:
     return write_text(tmp_path, FILES)
 
 
-def test_lazy_relative_and_package_imports_count_and_so_does_data_beside_them(root):
-    assert set(SourceTree(root).closure(["hoidata.stage"], {})) == OF_STAGE
+def test_the_closure_has_lazy_relative_and_package_imports_and_data_files(root):
+    assert set(SourceTree(root).closure(["hoidata.stage"], {})) == STAGE_FILES
 
 
-@pytest.mark.parametrize("name", sorted(OF_STAGE))
-def test_each_file_of_it_changes_a_digest(root, name):
+@pytest.mark.parametrize("name", sorted(STAGE_FILES))
+def test_an_edit_of_a_file_changes_its_digest_alone(root, name):
     before = SourceTree(root).closure(["hoidata.stage"], {})
     (root / name).write_text(f"{FILES[name]}\n")
     after = SourceTree(root).closure(["hoidata.stage"], {})
     assert {key for key in after if after[key] != before[key]} == {name}
 
 
-def test_what_a_registry_picks_counts_only_for_those_who_reach_the_registry(root):
+def test_the_choices_of_a_registry_count_only_if_the_registry_is_reached(root):
     chosen = {"hoidata.registry": [ADAPTER]}
-    assert set(SourceTree(root).closure(["hoidata.stage"], chosen)) == OF_STAGE
-    found = set(SourceTree(root).closure(["hoidata.registry"], chosen))
-    assert {"hoidata/datasets/grab/adapter.py", "hoidata/datasets/grab/words.csv"} <= found
-    assert "hoidata/datasets/h2o/adapter.py" not in found
+    assert set(SourceTree(root).closure(["hoidata.stage"], chosen)) == STAGE_FILES
+    closure = set(SourceTree(root).closure(["hoidata.registry"], chosen))
+    assert {"hoidata/datasets/grab/adapter.py", "hoidata/datasets/grab/words.csv"} <= closure
+    assert "hoidata/datasets/h2o/adapter.py" not in closure
 
 
-def test_of_a_table_of_names_only_what_is_picked_counts(root):
-    chosen = {"hoidata.registry": [replace(ADAPTER, is_table=True)]}
-    found = SourceTree(root).closure(["hoidata.registry"], chosen)
-    assert "hoidata/datasets/grab/adapter.py" in found
-    assert "hoidata/registry.py" not in found
+def test_of_a_registry_only_the_selection_counts(root):
+    chosen = {"hoidata.registry": [replace(ADAPTER, is_registry=True)]}
+    closure = SourceTree(root).closure(["hoidata.registry"], chosen)
+    assert "hoidata/datasets/grab/adapter.py" in closure
+    assert "hoidata/registry.py" not in closure
 
 
-def test_files_that_a_module_reads_by_name_count_for_it_and_not_for_the_package_they_lie_in(root):
+def test_files_that_a_module_selects_count_for_the_module_and_not_for_their_package(root):
     chosen = {"hoidata.registry": [ADAPTER], "hoidata.reader": [SPLITS]}
     assert "hoidata/datasets/grab/splits.json" not in SourceTree(root).closure(["hoidata.registry"], chosen)
-    found = SourceTree(root).closure(["hoidata.reader"], chosen)
-    assert set(found) == {"hoidata/__init__.py", "hoidata/reader.py", "hoidata/datasets/grab/splits.json"}
+    closure = SourceTree(root).closure(["hoidata.reader"], chosen)
+    assert set(closure) == {"hoidata/__init__.py", "hoidata/reader.py", "hoidata/datasets/grab/splits.json"}
 
 
-def test_a_package_whose_folder_lies_elsewhere_is_named_as_it_is_imported(root, tmp_path_factory):
+def test_files_of_a_package_outside_of_the_project_have_their_import_path_as_key(root, tmp_path_factory):
     folder = tmp_path_factory.mktemp("outside") / "kitchen"
     write_text(folder, {"adapter.py": "from hoidata.datasets.kitchen import words", "words.py": "", "facts.toml": ""})
     tree = SourceTree(root, {"hoidata.datasets.kitchen": folder})
     modules = tree.modules_below("hoidata.datasets.kitchen")
     assert modules == ["hoidata.datasets.kitchen.adapter", "hoidata.datasets.kitchen.words"]
-    found = tree.closure(modules[:1], {})
-    assert {f"hoidata/datasets/kitchen/{name}" for name in ("adapter.py", "words.py", "facts.toml")} <= set(found)
+    closure = tree.closure(modules[:1], {})
+    assert {f"hoidata/datasets/kitchen/{name}" for name in ("adapter.py", "words.py", "facts.toml")} <= set(closure)
 
 
 def test_a_package_that_registers_an_adapter_counts_with_its_files_and_version(root, tmp_path_factory, monkeypatch):
@@ -112,7 +112,7 @@ def test_a_package_that_registers_an_adapter_counts_with_its_files_and_version(r
         site,
         {
             "toy_hoi/__init__.py": "",
-            "toy_hoi/adapter.py": "from toy_hoi import words\nfrom hoidata.room import beside",
+            "toy_hoi/adapter.py": "from toy_hoi import words\nfrom hoidata.kit import sibling",
             "toy_hoi/words.py": "",
             "toy_hoi-1.2.dist-info/METADATA": "Metadata-Version: 2.1\nName: toy-hoi\nVersion: 1.2\n",
             "toy_hoi-1.2.dist-info/entry_points.txt": "[hoidata.adapters]\ntoy = toy_hoi.adapter:Toy\n",
@@ -120,38 +120,38 @@ def test_a_package_that_registers_an_adapter_counts_with_its_files_and_version(r
     )
     monkeypatch.syspath_prepend(str(site))
     tree = SourceTree(root)
-    assert tree.added("hoidata.adapters", "toy") == ["toy_hoi.adapter"]
-    found = tree.closure(["toy_hoi.adapter"], {})
-    assert found["distribution toy-hoi"] == "1.2"
-    assert {"toy_hoi/adapter.py", "toy_hoi/words.py", "hoidata/room/beside.py"} <= set(found)
+    assert tree.entry_point_modules("hoidata.adapters", "toy") == ["toy_hoi.adapter"]
+    closure = tree.closure(["toy_hoi.adapter"], {})
+    assert closure["distribution toy-hoi"] == "1.2"
+    assert {"toy_hoi/adapter.py", "toy_hoi/words.py", "hoidata/kit/sibling.py"} <= set(closure)
 
 
 @pytest.mark.parametrize("damage", ["", "[]", '{"x": 1}', '{"scanner": "another", "imports": %s}'])
-def test_kept_imports_change_no_answer_and_damaged_ones_are_parsed_again(root, damage):
+def test_cached_imports_change_no_result_and_a_damaged_cache_is_ignored(root, damage):
     (root / ".hoidata").mkdir()
     for _ in range(2):
         tree = SourceTree(root)
-        assert set(tree.closure(["hoidata.stage"], {})) == OF_STAGE
-        tree.keep_imports()
-    assert (root / KNOWN_IMPORTS).is_file()
-    (root / "hoidata/room/beside.py").write_text("import hoidata.typed")
+        assert set(tree.closure(["hoidata.stage"], {})) == STAGE_FILES
+        tree.save_imports()
+    assert (root / CACHED_IMPORTS).is_file()
+    (root / "hoidata/kit/sibling.py").write_text("import hoidata.typed")
     assert "hoidata/typed.py" in SourceTree(root).closure(["hoidata.stage"], {})
-    nothing = {digest: [] for digest in SourceTree(root).closure(["hoidata.stage"], {}).values()}
-    (root / KNOWN_IMPORTS).write_text(damage.replace("%s", json.dumps(nothing)))
+    no_imports = {digest: [] for digest in SourceTree(root).closure(["hoidata.stage"], {}).values()}
+    (root / CACHED_IMPORTS).write_text(damage.replace("%s", json.dumps(no_imports)))
     assert "hoidata/typed.py" in SourceTree(root).closure(["hoidata.stage"], {})
 
 
 @settings(max_examples=10, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(MODULES), st.sampled_from(IMPORTS)), min_size=1, max_size=6))
-def test_kept_imports_give_the_digests_of_a_fresh_look_whatever_was_edited(edits):
+def test_cached_and_parsed_imports_give_the_same_digests_after_edits(edits):
     with TemporaryDirectory() as folder:
         root = Path(folder)
         write_text(root, {".hoidata/x": "", **FILES})
         for name, text in edits:
             write_text(root, {name: text})
             tree = SourceTree(root)
-            with_kept = tree.closure(["hoidata.stage"], {})
-            tree.keep_imports()
-            (root / KNOWN_IMPORTS).rename(root / "kept")
-            assert with_kept == SourceTree(root).closure(["hoidata.stage"], {})
-            (root / "kept").rename(root / KNOWN_IMPORTS)
+            with_cache = tree.closure(["hoidata.stage"], {})
+            tree.save_imports()
+            (root / CACHED_IMPORTS).rename(root / "hidden")
+            assert with_cache == SourceTree(root).closure(["hoidata.stage"], {})
+            (root / "hidden").rename(root / CACHED_IMPORTS)

@@ -1,4 +1,4 @@
-"""Provenance and its comparison with today, on a graph of two stages in a temporary folder."""
+"""Provenance and its comparison with the present files, on a graph of two stages in a temporary folder."""
 
 import json
 import shutil
@@ -111,14 +111,14 @@ def test_graph_holds_the_stages_of_all_families_with_their_addresses(root):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", ["this project", "a small one"])
-def test_the_graph_read_without_dvc_is_the_one_dvc_reads(root, place):
-    at = Path(__file__).parents[3] if place == "this project" else root
-    assert written_graph(at) == read_graph(at)
+@pytest.mark.parametrize("project", ["this project", "a small one"])
+def test_the_graph_read_without_dvc_equals_the_one_dvc_reads(root, project):
+    folder = Path(__file__).parents[3] if project == "this project" else root
+    assert written_graph(folder) == read_graph(folder)
 
 
-def test_a_record_is_made_while_dvc_writes_its_lock_file(root):
-    """Stages run side by side: DVC writes down one that ended while another asks which stages are behind it."""
+def test_provenance_is_built_while_dvc_writes_its_lock_file(root):
+    """Stages run in parallel: DVC writes the entry of one while another builds its provenance."""
     before = build_provenance(root, TRAIN, FACTS)
     (root / "dvc.lock").write_text("schema: '2.0'\nstages:\n  convert@grab:\n    cm")
     with pytest.raises(BadInput, match=r"dvc\.lock"):
@@ -126,7 +126,7 @@ def test_a_record_is_made_while_dvc_writes_its_lock_file(root):
     assert build_provenance(root, TRAIN, FACTS) == before
 
 
-def test_of_a_graph_with_what_is_not_understood_here_dvc_is_asked(root):
+def test_a_graph_with_unknown_syntax_is_read_by_dvc(root):
     (root / "dvc.yaml").write_text(
         "stages: {each: {foreach: [a, b], do: {cmd: 'echo ${item}', outs: ['${item}.txt']}}}"
     )
@@ -139,14 +139,14 @@ def test_a_graph_dvc_cannot_read_is_refused(root):
         read_graph(root)
 
 
-def test_missing_param_is_refused_with_the_known_ones():
+def test_a_missing_param_is_refused_with_the_existing_keys():
     with pytest.raises(BadInput, match="one of: lr"):
         look_up({"train": {"lr": 1}}, "train.rate")
 
 
-def test_tree_names_every_stage_param_code_and_manifest_behind_a_checkpoint(root, checkpoint):
-    found = status_of(root, checkpoint)
-    assert set(found.values()) == {"same"}
+def test_the_tree_has_all_stages_params_code_and_manifests_behind_a_checkpoint(root, checkpoint):
+    statuses = status_of(root, checkpoint)
+    assert set(statuses.values()) == {"same"}
     assert {
         f"stage {TRAIN}",
         "param train.demo.contact",
@@ -156,7 +156,7 @@ def test_tree_names_every_stage_param_code_and_manifest_behind_a_checkpoint(root
         "param convert",
         "code hoidata/datasets/grab/adapter.py",
         "manifest manifests/grab.json",
-    } <= set(found)
+    } <= set(statuses)
 
 
 @pytest.mark.parametrize(
@@ -177,13 +177,13 @@ def test_a_change_of_any_input_is_found(root, checkpoint, path, text, node):
     assert overall_status(tree_of(root, checkpoint)) == "changed"
 
 
-def test_a_changed_param_says_what_it_was_and_is(root, checkpoint):
+def test_a_changed_param_shows_both_values(root, checkpoint):
     (root / "params.yaml").write_text(PARAMS.replace("lr: 0.1", "lr: 0.5"))
     nodes = tree_of(root, checkpoint).walk()
     assert next(node.detail for node in nodes if node.name == "train.demo.contact") == "lr: 0.1 -> 0.5"
 
 
-def test_what_is_gone_is_missing(root, checkpoint):
+def test_a_deleted_input_is_missing(root, checkpoint):
     (root / "manifests/grab.json").unlink()
     assert status_of(root, checkpoint)["manifest manifests/grab.json"] == "missing"
     assert overall_status(tree_of(root, checkpoint)) == "missing"
@@ -209,12 +209,12 @@ def test_tree_is_plain_json(root, checkpoint):
     assert json.loads(json.dumps(tree_as_json(tree)))["children"][0]["name"] == TRAIN
 
 
-def test_clips_it_was_trained_on_are_carried(root, checkpoint):
+def test_a_checkpoint_has_the_ids_of_its_training_clips(root, checkpoint):
     assert read_provenance(checkpoint)["clips"] == FACTS["clips"]
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00" * 7, b"\xff" * 16, (2).to_bytes(8, "little") + b"{}"])
-def test_what_is_no_checkpoint_is_refused_with_its_name(tmp_path, data):
+def test_a_malformed_checkpoint_is_refused_with_its_name(tmp_path, data):
     (tmp_path / "model.safetensors").write_bytes(data)
     with pytest.raises(BadInput, match=r"model\.safetensors: expected"):
         read_provenance(tmp_path / "model.safetensors")

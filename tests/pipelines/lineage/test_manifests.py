@@ -22,7 +22,7 @@ from tests.builders.folders import write_text
 
 @pytest.fixture
 def raw(tmp_path: Path) -> Path:
-    """Two files, a folder of per-frame files, and things no adapter reads."""
+    """A raw folder with two files, a folder of per-frame files, and files that no adapter reads."""
     files = {
         "s1/mug.npz": "abc",
         "tools/table.json": "{}",
@@ -55,33 +55,33 @@ def test_manifest_comes_back_as_written(raw, tmp_path):
     assert read_manifest(tmp_path / "grab.json") == manifest
 
 
-def test_manifest_without_files_comes_back_as_written(tmp_path):
+def test_a_manifest_without_files_is_read_as_written(tmp_path):
     manifest = Manifest("grab", True, "generated", "CC0-1.0", recipe={"seed": 0, "size": "full"})
     write_manifest(tmp_path / "grab.json", manifest)
     assert read_manifest(tmp_path / "grab.json") == manifest
     assert manifest.synthetic
 
 
-def test_committed_manifests_are_in_the_form_we_write(tmp_path):
+def test_committed_manifests_have_the_format_of_write_manifest(tmp_path):
     for path in (Path(__file__).parents[3] / "manifests").glob("*/*.json"):
         write_manifest(tmp_path / "again.json", read_manifest(path))
         assert (tmp_path / "again.json").read_text() == path.read_text(), path
 
 
-def test_verify_names_what_is_missing_changed_and_unlisted(raw):
+def test_verify_lists_missing_changed_and_unlisted_files(raw):
     manifest = manifest_of(raw)
     assert verify_files(raw, manifest) == []
     (raw / "s1/mug.npz").unlink()
     (raw / "cam4/hand_pose/000001.txt").write_text("3 5")
     (raw / "s1/new.npz").write_text("n")
-    found = [(item.path, item.problem) for item in verify_files(raw, manifest)]
-    assert found == [("cam4/hand_pose", "changed"), ("s1/mug.npz", "missing"), ("s1/new.npz", "unlisted")]
+    problems = [(item.path, item.problem) for item in verify_files(raw, manifest)]
+    assert problems == [("cam4/hand_pose", "changed"), ("s1/mug.npz", "missing"), ("s1/new.npz", "unlisted")]
 
 
 @pytest.mark.parametrize(
     "text", ["", "[]", "{}", '{"schema": "hoidata.manifest/1", "colour": "red"}', '{"schema": "hoidata.manifest/9"}']
 )
-def test_what_is_no_manifest_is_refused_with_its_name(tmp_path, text):
+def test_a_malformed_manifest_is_refused_with_its_name(tmp_path, text):
     (tmp_path / "grab.json").write_text(text)
     with pytest.raises(BadInput, match=r"grab\.json: expected"):
         read_manifest(tmp_path / "grab.json")
@@ -110,12 +110,12 @@ def test_a_scan_by_parts_lists_only_files_an_adapter_reads(raw):
     assert next(entry.path for entry in scan_files(raw, PARTS)) == "GRAB/s1/cup.npz"
 
 
-def test_a_link_that_leads_back_does_not_make_a_scan_endless(raw):
+def test_a_link_to_a_parent_folder_does_not_make_a_scan_endless(raw):
     (raw / "s1" / "again").symlink_to(raw)
     assert [entry.path for entry in scan_files(raw)] == ["cam4/hand_pose", "s1/mug.npz", "tools/table.json"]
 
 
-def test_missing_parts_are_named_required_ones_first(raw):
+def test_missing_parts_are_listed_required_ones_first(raw):
     adapter = SimpleNamespace(parts=PARTS)
     assert [part.contents for part in missing_parts(adapter, raw)] == ["meshes", "tables"]
     assert part_of(adapter, "s3/cup.npz") is PARTS[1]
@@ -124,7 +124,7 @@ def test_missing_parts_are_named_required_ones_first(raw):
 
 
 @pytest.mark.parametrize("name", ["h2o", "grab", "arctic", "manipnet"])
-def test_the_manifest_of_a_dataset_nobody_has_states_its_terms(name):
+def test_the_manifest_of_an_absent_dataset_states_its_terms(name):
     manifest = absent_manifest(get_adapter(name))
     assert not manifest.present
     assert manifest.may_be_shared == (name == "manipnet")

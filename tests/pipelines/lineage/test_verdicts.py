@@ -1,4 +1,4 @@
-"""What ``hoidata lineage`` says of each piece in staged situations, on a project after a run."""
+"""The status that ``hoidata lineage`` gives each node after some edit, on a project after a run."""
 
 import json
 import shutil
@@ -26,9 +26,9 @@ RAW = ".hoidata/raw/embedded/grab"
 ADAPTER = "hoidata/datasets/grab/adapter.py"
 
 
-def found(root: Path | None, words: str = CONTACT, here: Path | None = None) -> dict[str, str]:
-    """Each piece that is not as recorded, with its verdict."""
-    tree = target_tree(root, find_target(root, words, here or root))
+def changed_nodes(root: Path | None, name: str = CONTACT, here: Path | None = None) -> dict[str, str]:
+    """The status of all nodes that are not as recorded."""
+    tree = target_tree(root, find_target(root, name, here or root))
     return {
         f"{node.kind} {node.name}": node.status for node in tree.walk() if node.status != "same" and not node.repeated
     }
@@ -77,85 +77,85 @@ SITUATIONS = {
 
 
 @pytest.mark.parametrize("situation", SITUATIONS)
-def test_each_staged_situation_gets_its_verdict(ran, situation):
+def test_each_edit_gets_its_status(ran, situation):
     change, expected = SITUATIONS[situation]
     change(ran)
     expected = {key.replace("RAW", (ran.root / RAW).as_posix()): status for key, status in expected.items()}
-    assert found(ran.root) == expected
+    assert changed_nodes(ran.root) == expected
     worst = overall_status(target_tree(ran.root, find_target(ran.root, CONTACT, ran.root)))
     assert worst == (next(iter(expected.values())) if expected else "same")
 
 
-def test_weights_made_zero_are_tampered_although_the_header_is_whole(ran):
+def test_overwritten_weights_are_tampered_although_the_header_is_intact(ran):
     path = ran.root / CONTACT
     data = path.read_bytes()
     path.write_bytes(data[:-16] + bytes(np.ones(4, np.float32)))
     target = find_target(ran.root, CONTACT, ran.root)
-    assert (target.status, target.note) == ("tampered", "the weights are not what was written")
+    assert (target.status, target.note) == ("tampered", "the weights differ from their checksum")
 
 
-def test_what_was_trained_with_edits_nobody_committed_is_uncommitted_until_they_are(ran):
+def test_a_checkpoint_trained_with_uncommitted_edits_is_uncommitted_until_the_commit(ran):
     ran.write({ADAPTER: "SCALE = 3"})
     set_param(ran.root, 0.7)
-    ran.again()
+    ran.run_again()
     expected = {f"code {ADAPTER}": "uncommitted", "code code": "uncommitted", "param train.demo.contact": "uncommitted"}
-    assert found(ran.root) == expected
+    assert changed_nodes(ran.root) == expected
     ran.commit()
-    assert found(ran.root) == {}
+    assert changed_nodes(ran.root) == {}
 
 
-def test_a_checkpoint_of_an_older_commit_names_the_commit_that_held_its_code_and_params(ran):
-    then = ran.git("rev-parse", "HEAD").strip()
-    kept = shutil.copytree((ran.root / CONTACT).parent, ran.root.parent / "kept")
+def test_a_checkpoint_of_an_older_commit_names_the_commit_with_its_code_and_params(ran):
+    old_commit = ran.git("rev-parse", "HEAD").strip()
+    copy = shutil.copytree((ran.root / CONTACT).parent, ran.root.parent / "kept")
     ran.write({ADAPTER: "SCALE = 2"})
     set_param(ran.root, 0.5)
-    ran.again()
+    ran.run_again()
     ran.commit()
-    target = find_target(ran.root, str(kept))
-    assert (target.status, target.note[-17:]) == ("same", f"commit {then[:10]}")
+    target = find_target(ran.root, str(copy))
+    assert (target.status, target.note[-17:]) == ("same", f"commit {old_commit[:10]}")
     nodes = {node.name: node for node in target_tree(ran.root, target).walk()}
     assert nodes[ADAPTER].status == nodes["train.demo.contact"].status == "changed"
-    assert nodes[ADAPTER].detail == f"as recorded in commit {then[:10]}"
-    assert nodes["train.demo.contact"].detail == f"lr: 0.1 -> 0.5 (as recorded in commit {then[:10]})"
+    assert nodes[ADAPTER].detail == f"as recorded in commit {old_commit[:10]}"
+    assert nodes["train.demo.contact"].detail == f"lr: 0.1 -> 0.5 (as recorded in commit {old_commit[:10]})"
 
 
 def test_a_digest_of_an_older_run_is_found_in_git(ran):
     digest = dvc_digest((ran.root / CONTACT).parent)
-    then = ran.git("rev-parse", "HEAD").strip()
+    old_commit = ran.git("rev-parse", "HEAD").strip()
     set_param(ran.root, 0.5)
-    ran.again()
+    ran.run_again()
     ran.commit()
     target = find_target(ran.root, digest)
     assert (target.kind, target.status) == ("checkpoint", "missing")
-    assert then[:10] in target.note
-    assert found(ran.root, digest)["param train.demo.contact"] == "changed"
+    assert old_commit[:10] in target.note
+    assert changed_nodes(ran.root, digest)["param train.demo.contact"] == "changed"
 
 
 @pytest.mark.parametrize("digest", [payload_digest, sha256_file, dvc_digest])
-def test_a_checkpoint_is_found_by_each_of_its_digests_and_their_beginnings(ran, digest):
+def test_a_checkpoint_is_found_by_each_of_its_digests_and_their_prefixes(ran, digest):
     for length in (64, 12):
         target = find_target(ran.root, digest(ran.root / CONTACT)[:length])
         assert target.kind == "checkpoint"
         assert target.record["schema"] == "hoidata.provenance/1"
 
 
-def test_a_digest_of_nothing_and_a_path_of_nothing_are_refused(ran):
-    for words in ("0123456789ab", "checkpoints/none", "params.yaml"):
+def test_an_unknown_digest_and_an_unknown_path_are_refused(ran):
+    for name in ("0123456789ab", "checkpoints/none", "params.yaml"):
         with pytest.raises(BadInput):
-            find_target(ran.root, words, ran.root)
+            find_target(ran.root, name, ran.root)
 
 
-def test_a_file_copied_out_is_known_and_one_no_lock_knows_is_an_orphan(ran, tmp_path):
+def test_a_copied_checkpoint_is_recognised_and_one_in_no_lock_file_is_an_orphan(ran, tmp_path):
     copied = Path(shutil.copytree((ran.root / CONTACT).parent, tmp_path / "copied"))
-    assert found(ran.root, str(copied)) == {}
+    assert changed_nodes(ran.root, str(copied)) == {}
     for lock in (ran.root / "dvc.lock", ran.root / "models/text2hoi/dvc.lock"):
         lock.write_text("schema: '2.0'\nstages: {}\n")
-    assert found(ran.root, str(copied)) == {}, "the commit still knows it"
+    assert changed_nodes(ran.root, str(copied)) == {}, "the commit still has it"
     shutil.rmtree(ran.root / ".git")
-    assert found(ran.root, str(copied)) == {f"checkpoint {copied / 'model.safetensors'}": "orphan"}
+    assert changed_nodes(ran.root, str(copied)) == {f"checkpoint {copied / 'model.safetensors'}": "orphan"}
 
 
-def test_outside_any_project_the_header_tells_all_and_nothing_is_compared(ran, tmp_path):
+def test_outside_of_a_project_the_header_has_the_whole_tree_and_nothing_is_compared(ran, tmp_path):
     path = tmp_path / "elsewhere.safetensors"
     shutil.copy(ran.root / CONTACT, path)
     shutil.rmtree(ran.root)
@@ -173,18 +173,18 @@ def test_outside_any_project_the_header_tells_all_and_nothing_is_compared(ran, t
     assert overall_status(target_tree(None, find_target(None, str(path)))) == "tampered"
 
 
-def test_the_users_own_raw_files_that_are_gone_are_licensed_data_one_needs(ran, monkeypatch):
+def test_missing_raw_files_of_the_user_have_the_status_needs_licensed_data(ran, monkeypatch):
     monkeypatch.chdir(ran.root)
     listed = json.loads((ran.root / "data/embedded/grab/raw.json").read_text())
     ran.write({"data/embedded/grab/raw.json": json.dumps(listed | {"source": "files"})})
-    ran.again()
+    ran.run_again()
     ran.commit()
-    assert found(ran.root) == {"raw grab": "needs licensed data"}
+    assert changed_nodes(ran.root) == {"raw grab": "needs licensed data"}
     monkeypatch.setenv("HOIDATA_GRAB", str(ran.root / RAW))
-    assert found(ran.root) == {}
+    assert changed_nodes(ran.root) == {}
 
 
-def test_an_adapter_of_another_package_counts_like_our_own(project_builder, tmp_path, monkeypatch):
+def test_an_adapter_of_another_package_counts_as_code(project_builder, tmp_path, monkeypatch):
     site, root = tmp_path / "site", tmp_path / "project"
     entry = "[hoidata.adapters]\ngrab = toy_reader.adapter:Toy\n"
     files = {
@@ -197,48 +197,48 @@ def test_an_adapter_of_another_package_counts_like_our_own(project_builder, tmp_
     root.mkdir()
     monkeypatch.syspath_prepend(str(site))
     project_builder.build(root, {name: text for name, text in project_builder.code.items() if name != ADAPTER})
-    assert found(root) == {}
+    assert changed_nodes(root) == {}
     (site / "toy_reader/adapter.py").write_text("SCALE = 2")
-    assert found(root) == {"code toy_reader/adapter.py": "changed", "code code": "changed"}
+    assert changed_nodes(root) == {"code toy_reader/adapter.py": "changed", "code code": "changed"}
 
 
 @pytest.mark.parametrize("name", [CLIPS, "samples/embedded/grab/text2hoi/clips", "metrics/embedded/grab/text2hoi.json"])
-def test_stores_samples_and_metrics_have_a_lineage_too(ran, name):
-    assert found(ran.root, name) == {}
+def test_stores_samples_and_metrics_have_a_lineage(ran, name):
+    assert changed_nodes(ran.root, name) == {}
     ran.write({ADAPTER: "SCALE = 2"})
-    assert found(ran.root, name)["code code"] == "changed"
+    assert changed_nodes(ran.root, name)["code code"] == "changed"
     path = ran.root / name
     victim = path if path.is_file() else path / "meta/info.json"
     victim.write_text(victim.read_text() + " ")
-    assert found(ran.root, name)[f"data {name}"] == "tampered"
+    assert changed_nodes(ran.root, name)[f"data {name}"] == "tampered"
 
 
-def test_a_generated_motion_leads_to_the_networks_that_made_it(ran):
+def test_the_tree_of_a_generated_motion_has_its_networks(ran):
     motion = ran.root / "generated/motion.npz"
     motion.parent.mkdir()
     np.savez(motion, checkpoints=np.array(canonical_json({CONTACT: sha256_file(ran.root / CONTACT)})))
-    assert found(ran.root, "generated") == {}
+    assert changed_nodes(ran.root, "generated") == {}
     flip(ran.root / CONTACT, -1)
-    assert found(ran.root, "generated") == {f"checkpoint {CONTACT}": "tampered"}
-    ran.again(weights=1.0)
-    assert found(ran.root, "generated") == {f"checkpoint {CONTACT}": "changed"}
+    assert changed_nodes(ran.root, "generated") == {f"checkpoint {CONTACT}": "tampered"}
+    ran.run_again(weights=1.0)
+    assert changed_nodes(ran.root, "generated") == {f"checkpoint {CONTACT}": "changed"}
     (ran.root / CONTACT).unlink()
-    assert found(ran.root, "generated") == {f"checkpoint {CONTACT}": "missing"}
-    assert set(found(None, str(motion)).values()) == {"recorded"}
+    assert changed_nodes(ran.root, "generated") == {f"checkpoint {CONTACT}": "missing"}
+    assert set(changed_nodes(None, str(motion)).values()) == {"recorded"}
 
 
 @pytest.mark.parametrize(
-    ("victim", "piece"),
+    ("victim", "node_prefix"),
     [
         (CONTACT, f"checkpoint {CONTACT}"),
         (f"{CLIPS}/meta/info.json", f"data {CLIPS}"),
         (f"{RAW}/tools/mug.ply", "raw "),
     ],
 )
-def test_check_reads_every_byte_again_and_names_what_is_not_as_written(ran, victim, piece):
+def test_check_hashes_all_files_and_lists_those_that_have_changed(ran, victim, node_prefix):
     assert {node.status for node in check(ran.root)} == {"same"}
     flip(ran.root / victim, -1)
-    wrong = [node for node in check(ran.root) if node.status != "same"]
-    assert any(f"{node.kind} {node.name}".startswith(piece) for node in wrong)
-    behind = find_target(ran.root, "checkpoints/embedded/grab/length", ran.root)
-    assert all("contact" not in node.name for node in check(ran.root, behind))
+    changed = [node for node in check(ran.root) if node.status != "same"]
+    assert any(f"{node.kind} {node.name}".startswith(node_prefix) for node in changed)
+    target = find_target(ran.root, "checkpoints/embedded/grab/length", ran.root)
+    assert all("contact" not in node.name for node in check(ran.root, target))

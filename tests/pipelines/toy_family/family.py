@@ -1,4 +1,4 @@
-"""The smallest family that learns: one number per feature, the pose that training clips have on average."""
+"""The smallest family that learns: it predicts the mean pose of the training clips, one value per feature."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ from models.common.losses import masked_mean
 
 @dataclass(frozen=True)
 class ToyConfig:
-    """start: what every feature is before training."""
+    """Settings of the network."""
 
     start: float = 0.1
 
 
 class ToyNetwork(nn.Module):
-    """Hands (2, 99) and object (10,): the same in every frame of every motion."""
+    """Parameters for hands (2, 99) and object (10,), the same in all frames of all motions."""
 
     def __init__(self, config: ToyConfig) -> None:
         super().__init__()
@@ -56,7 +56,7 @@ class ToyObjective:
 
 @dataclass(frozen=True)
 class Toy:
-    """The learnt pose, ready to answer."""
+    """A family that answers all requests with the learned pose."""
 
     checkpoint: Checkpoint
 
@@ -67,8 +67,8 @@ class Toy:
         network = self.checkpoint.network
         assert isinstance(network, ToyNetwork)
         hands = proper_hands(network.hands.detach()[:, None].expand(-1, request.n_frames, -1))
-        thing = proper_object(network.object.detach().expand(request.n_frames, -1))
-        return motion_clip(request, hands, thing, self.checkpoint.facts["synthetic"])
+        object_parameters = proper_object(network.object.detach().expand(request.n_frames, -1))
+        return motion_clip(request, hands, object_parameters, self.checkpoint.facts["synthetic"])
 
 
 NETWORK = Network("toy", ToyConfig, ToyNetwork, lambda setup: (ToyObjective(setup), None))
