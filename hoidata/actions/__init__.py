@@ -1,1 +1,1 @@
-"""What an object does in a clip, and what a verb asks of it: for figures, and for motions that are drawn again."""
+"""Measures of object motion, the limits that a verb sets on them, and their usual range in training clips."""

@@ -1,10 +1,8 @@
-"""What an object does in a clip, in numbers, and whether that is what a verb says.
+"""Measures of object motion, and a rule-based test of whether a motion shows a verb.
 
-``actions.toml`` beside this file holds what a verb asks of a motion, one table per verb, ``number = [least, most]``;
-a motion follows the verb when all of them hold. A table counts for a dataset when nine in ten of the verb's own
-training clips follow it; for every other verb the limits are learnt from those clips.
-
-Numbers of a motion in words, beside the bounds they usually have, for a person to read.
+``actions.toml`` next to this file has one table of limits per verb: ``measure = [minimum, maximum]``. A motion shows
+the verb if all measures are within their limits. A table is used for a dataset if 90 % of the verb's training clips
+satisfy it. For other verbs, the limits are computed from the training clips.
 """
 
 import tomllib
@@ -24,119 +22,113 @@ from hoidata.geometry.rotations import turns_about
 from hoidata.store.annotated import AnnotatedStore
 
 
-class Words(NamedTuple):
-    """One number of a motion.
+class MeasureText(NamedTuple):
+    """How a measure is shown to a person, and which difference is visible."""
 
-    what: its name. unit: after the number. seen: by how much it must lie outside the usual bounds for a person who
-    watches the motion to see that, in the number's own unit. times: from that unit to ``unit``. signed: may be below 0.
-    """
-
-    what: str
-    unit: str
-    seen: float
-    times: float = 1.0
-    signed: bool = False
+    label: str
+    unit: str  # shown after the number; "" for counts
+    visible_difference: float  # distance from the usual range that a viewer notices, in the unit of the measure
+    display_factor: float = 1.0  # from the unit of the measure to ``unit``
+    signed: bool = False  # whether the measure can be negative
 
 
-# What a person sees without measuring. Places: a square of the grid under every motion. Angles: an hour on the face of
-# a clock. Sums over a motion count what goes there and back twice. A hand jumps where it crosses a square in one frame.
-# A hand slides where that is the breadth of a finger in a second.
-PLACE_M, ANGLE_DEG, JUMP_M_S, SLIDE_CM_S = 0.10, 30.0, 3.0, 2.0
-WORDS = {
-    "rise_m": Words("highest rise", " cm", PLACE_M, 100),
-    "end_rise_m": Words("rise at the end", " cm", PLACE_M, 100, signed=True),
-    "sideways_m": Words("farthest sideways", " cm", PLACE_M, 100),
-    "end_sideways_m": Words("sideways at the end", " cm", PLACE_M, 100),
-    "tilt_deg": Words("greatest tilt", " degrees", ANGLE_DEG),
-    "end_tilt_deg": Words("tilt at the end", " degrees", ANGLE_DEG),
-    "turn_deg": Words("turning about the vertical in all", " degrees", 2 * ANGLE_DEG),
-    "end_turn_deg": Words("turned at the end, counter-clockwise from above,", " degrees", ANGLE_DEG, signed=True),
-    "path_m": Words("length of the path", " cm", 2 * PLACE_M, 100),
-    "reversals_per_s": Words("turns back", " times a second", 1.0),
-    "hinge_net_deg": Words("change of the hinge at the end", " degrees", ANGLE_DEG, signed=True),
-    "hinge_max_deg": Words("greatest change of the hinge", " degrees", ANGLE_DEG),
-    "hand_changes": Words("hands that take or give", "", 1.0),
-    "joint_m_s": Words("fastest joint", " m/s", JUMP_M_S),
-    "slip_cm_s": Words("slip of hands", " cm/s", SLIDE_CM_S),
+# Differences that a viewer notices. Position: one square of the grid that pages draw. Angle: one hour of a clock face.
+# Sums over a motion count a movement there and back twice. Joint speed: one square per frame. Slip: the width of a
+# finger per second.
+POSITION_M, ANGLE_DEG, JUMP_M_S, SLIDE_CM_S = 0.10, 30.0, 3.0, 2.0
+MEASURE_TEXTS = {
+    "rise_m": MeasureText("highest rise", " cm", POSITION_M, 100),
+    "end_rise_m": MeasureText("rise at the end", " cm", POSITION_M, 100, signed=True),
+    "sideways_m": MeasureText("farthest sideways", " cm", POSITION_M, 100),
+    "end_sideways_m": MeasureText("sideways at the end", " cm", POSITION_M, 100),
+    "tilt_deg": MeasureText("greatest tilt", " degrees", ANGLE_DEG),
+    "end_tilt_deg": MeasureText("tilt at the end", " degrees", ANGLE_DEG),
+    "turn_deg": MeasureText("turning about the vertical in all", " degrees", 2 * ANGLE_DEG),
+    "end_turn_deg": MeasureText("turned at the end, counter-clockwise from above,", " degrees", ANGLE_DEG, signed=True),
+    "path_m": MeasureText("length of the path", " cm", 2 * POSITION_M, 100),
+    "reversals_per_s": MeasureText("turns back", " times a second", 1.0),
+    "hinge_net_deg": MeasureText("change of the hinge at the end", " degrees", ANGLE_DEG, signed=True),
+    "hinge_max_deg": MeasureText("greatest change of the hinge", " degrees", ANGLE_DEG),
+    "hand_changes": MeasureText("hands that take or give", "", 1.0),
+    "joint_m_s": MeasureText("fastest joint", " m/s", JUMP_M_S),
+    "slip_cm_s": MeasureText("slip of hands", " cm/s", SLIDE_CM_S),
 }
 
 
-def beside_usual(name: str, value: float, least: float, most: float) -> str | None:
-    """One number outside its usual bounds, as ``highest rise 15.8 cm (usual: 19.1 to 23.7)``.
+def describe_unusual(name: str, value: float, least: float, most: float) -> str | None:
+    """Describe a measure outside of its usual range, as ``highest rise 15.8 cm (usual: 19.1 to 23.7)``.
 
-    None where it reads as the bound itself: what a person cannot tell apart is not said.
+    Returns None if the rounded value equals a rounded bound.
     """
-    what, unit, _, times, signed = WORDS[name]
-    if not unit:  # counted
+    label, unit, _, factor, signed = MEASURE_TEXTS[name]
+    if not unit:  # a count
         least, most = ceil(least), floor(most)
-    own, low, high = (_rounded(number * times) for number in (value, least, most))
-    if own in (low, high):
+    shown, low, high = (_rounded(number * factor) for number in (value, least, most))
+    if shown in (low, high):
         return None
-    return f"{what} {own}{unit} (usual: {f'{low} to {high}' if signed or least > 0 else f'at most {high}'})"
+    return f"{label} {shown}{unit} (usual: {f'{low} to {high}' if signed or least > 0 else f'at most {high}'})"
 
 
-def is_seen(name: str, value: float, least: float, most: float) -> bool:
-    """Whether a number lies so far outside its usual bounds that a person who watches the motion sees it."""
-    if not WORDS[name].unit:
+def is_visible(name: str, value: float, least: float, most: float) -> bool:
+    """Whether a measure is so far outside of its usual range that a viewer notices."""
+    if not MEASURE_TEXTS[name].unit:
         least, most = ceil(least), floor(most)
-    return max(least - value, value - most) >= WORDS[name].seen
+    return max(least - value, value - most) >= MEASURE_TEXTS[name].visible_difference
 
 
 def _rounded(number: float) -> str:
-    """Three digits, and never a power of ten."""
+    """Round to three digits, without an exponent."""
     return f"{number:.0f}" if abs(number) >= 1000 else f"{number:.3g}"
 
 
 TABLE = Path(__file__).with_name("actions.toml")
-NUMBERS = {
-    "rise_m": "greatest height of the object's middle over that of the first frame",
+MEASURES = {
+    "rise_m": "greatest height of the object's centre above its height in the first frame",
     "end_rise_m": "the same in the last frame",
-    "sideways_m": "greatest horizontal distance of the middle from where it was first",
+    "sideways_m": "greatest horizontal distance of the centre from its position in the first frame",
     "end_sideways_m": "the same in the last frame",
-    "tilt_deg": "greatest angle between the object's first upright direction and the upright",
+    "tilt_deg": "greatest angle between the vertical and the object direction that is vertical in the first frame",
     "end_tilt_deg": "the same in the last frame",
-    "turn_deg": "turns about the upright, either way, added up; of steps smoothed over 5 frames, so that none is noise",
-    "end_turn_deg": "by how much it has turned about the upright in the last frame, counter-clockwise from above",
-    "path_m": "length of the middle's path",
-    "reversals_per_s": "how often the middle turns back: 2 mm or more in 0.1 s, and as much the other way",
-    "hinge_net_deg": "hinge angle of the last frame less that of the first; 0 for a rigid object",
-    "hinge_max_deg": "greatest change of the hinge angle since the first frame, either way; 0 for a rigid object",
-    "hand_changes": "hands that hold it first and not last, or the reverse: 0, 1 or 2",
-    "first_left": "1 where the left hand holds it first: touches in half of the first quarter of the touched time",
-    "first_right": "1 where the right hand holds it first",
-    "last_left": "1 where the left hand holds it last: in half of the last quarter",
-    "last_right": "1 where the right hand holds it last",
+    "turn_deg": "sum of the absolute rotations about the vertical, of steps smoothed over 5 frames against noise",
+    "end_turn_deg": "rotation about the vertical from the first to the last frame, counter-clockwise from above",
+    "path_m": "path length of the centre",
+    "reversals_per_s": "rate of reversals of the centre: 2 mm or more in 0.1 s, then as much in the opposite direction",
+    "hinge_net_deg": "change of the hinge angle from the first to the last frame; 0 for a rigid object",
+    "hinge_max_deg": "greatest absolute change of the hinge angle since the first frame; 0 for a rigid object",
+    "hand_changes": "number of hands that grasp the object only at the start or only at the end: 0, 1 or 2",
+    "first_left": "1 if the left hand grasps at the start: contact in half of the first quarter of the contact time",
+    "first_right": "1 if the right hand grasps at the start",
+    "last_left": "1 if the left hand grasps at the end: contact in half of the last quarter of the contact time",
+    "last_right": "1 if the right hand grasps at the end",
 }
 HANDS = {"one hold": (0.0, 0.0), "change": (1.0, 2.0)}  # `hands` in actions.toml, as limits of `hand_changes`
-OF_GIVEN_HANDS = ("first_left", "first_right", "last_left", "last_right")  # asked for in words, so no part of a verb
-LEARNT = tuple(name for name in NUMBERS if name not in OF_GIVEN_HANDS)
-LEAST_CLIPS = 3  # of a verb to learn its limits from
-SHARE_THAT_FOLLOWS = 0.9
-MARGIN = 0.5  # deviations, added to the 1st and 99th percentile of the verb's own clips
-ALIKE = 0.25  # of the deviation of all clips: a verb whose own deviate by no more says nothing of how much is usual
-LEAST_DEVIATION = {
-    "m": 0.03,
-    "deg": 10.0,
-    "s": 1.0,
-    "changes": 1.0,
-}  # by the end of a number's name: what counts little
-_BACK_FRAMES, _BACK_M = 3, 0.002
-_SMOOTH = 5
+HAND_MEASURES = ("first_left", "first_right", "last_left", "last_right")  # a request states the hands, not the verb
+VERB_MEASURES = tuple(name for name in MEASURES if name not in HAND_MEASURES)
+MIN_CLIPS = 3  # of a verb, to compute its limits
+MIN_FRACTION_WITHIN = 0.9  # of a verb's training clips, to use its table of actions.toml
+MARGIN = 0.5  # standard deviations, added to the 1st and 99th percentile of the verb's clips
+MIN_RELATIVE_DEVIATION = 0.25  # of all clips' deviation; below it, a verb's deviation is not representative
+# Minimum standard deviation, by the unit at the end of a measure's name: smaller differences do not matter.
+MIN_DEVIATION = {"m": 0.03, "deg": 10.0, "s": 1.0, "changes": 1.0}
+_REVERSAL_FRAMES, _REVERSAL_M = 3, 0.002
+_SMOOTHING_FRAMES = 5
 Limits = dict[str, tuple[float, float]]
 
 
 def action_numbers(track: ObjectTrack, gravity: np.ndarray | None, touching: np.ndarray) -> dict[str, float]:
-    """``NUMBERS`` of one motion; NaN for what needs gravity where that is not known.
+    """Compute ``MEASURES`` of one motion. Measures that need gravity are NaN without it.
 
-    gravity: (3,) unit vector in the world, or None. touching: (2, frame) bool, whether the left and the right hand
-    touch the object.
+    Args:
+        track: motion of the object.
+        gravity: (3,) unit vector in the world, or None if unknown.
+        touching: (2, frame) bool, whether the left and the right hand touch the object.
     """
     degrees = np.zeros(track.n_frames)
     if track.hinge_rad is not None:
         degrees = np.degrees(track.hinge_rad - track.hinge_rad[0], dtype=np.float64)
     middle_m = object_middle_m(track)
-    nothing = dict.fromkeys(NUMBERS, float("nan"))
-    return nothing | _upright(track, middle_m, gravity) | _touching(touching) | {
+    unknown = dict.fromkeys(MEASURES, float("nan"))
+    return unknown | _upright(track, middle_m, gravity) | _touching(touching) | {
         "path_m": float(np.linalg.norm(np.diff(middle_m, axis=0), axis=1).sum()),
         "reversals_per_s": _reversals(middle_m) * FPS / track.n_frames,
         "hinge_net_deg": float(degrees[-1]),
@@ -145,23 +137,26 @@ def action_numbers(track: ObjectTrack, gravity: np.ndarray | None, touching: np.
 
 
 def object_middle_m(track: ObjectTrack) -> np.ndarray:
-    """(frame, 3) world: the middle of the box about the object's base."""
+    """Return (frame, 3) world positions of the centre of the base part's bounding box, metres."""
     base = track.model.vertices_m[np.unique(track.model.faces_of(0))]
     return (track.world_from_object @ ((base.min(axis=0) + base.max(axis=0)) / 2)[None])[:, 0]
 
 
 def _upright(track: ObjectTrack, middle_m: np.ndarray, gravity: np.ndarray | None) -> dict[str, float]:
-    """What is measured against gravity. middle_m: (frame, 3) world."""
+    """Measures that need gravity. middle_m: (frame, 3) world positions of the object's centre."""
     if gravity is None:
         return {}
     up = -np.asarray(gravity, np.float64)
-    way = middle_m - middle_m[0]
-    rise, sideways = way @ up, np.linalg.norm(way - (way @ up)[:, None] * up, axis=1)
+    offset_m = middle_m - middle_m[0]
+    rise, sideways = offset_m @ up, np.linalg.norm(offset_m - (offset_m @ up)[:, None] * up, axis=1)
     rotation = track.world_from_object.rotation
     since_first = rotation @ rotation[0].T
     tilt = np.degrees(np.arccos(np.clip((since_first @ up) @ up, -1, 1)))
     steps = turns_about(rotation, up)
-    turn = np.degrees(np.abs(np.convolve(steps, np.full(_SMOOTH, 1 / _SMOOTH), mode="full")).sum())
+    # Smoothing first: tracking noise would add up in a sum of absolute steps.
+    turn_deg = np.degrees(
+        np.abs(np.convolve(steps, np.full(_SMOOTHING_FRAMES, 1 / _SMOOTHING_FRAMES), mode="full")).sum()
+    )
     return {
         "rise_m": float(rise.max()),
         "end_rise_m": float(rise[-1]),
@@ -169,111 +164,102 @@ def _upright(track: ObjectTrack, middle_m: np.ndarray, gravity: np.ndarray | Non
         "end_sideways_m": float(sideways[-1]),
         "tilt_deg": float(tilt.max()),
         "end_tilt_deg": float(tilt[-1]),
-        "turn_deg": float(turn),
+        "turn_deg": float(turn_deg),
         "end_turn_deg": float(np.degrees(steps.sum())),
     }
 
 
 def _reversals(middle_m: np.ndarray) -> int:
-    """How often a path (frame, 3) turns back on itself."""
-    step = middle_m[_BACK_FRAMES:] - middle_m[:-_BACK_FRAMES]
-    before, after = step[:-_BACK_FRAMES], step[_BACK_FRAMES:]
+    """Count the reversals of a path (frame, 3): direction changes of more than 120 degrees."""
+    step = middle_m[_REVERSAL_FRAMES:] - middle_m[:-_REVERSAL_FRAMES]
+    before, after = step[:-_REVERSAL_FRAMES], step[_REVERSAL_FRAMES:]
     length = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
-    back = (before * after).sum(axis=1) < -0.5 * length[0] * length[1]
-    return len(runs(back & (np.minimum(*length) >= _BACK_M)))
+    is_reversal = (before * after).sum(axis=1) < -0.5 * length[0] * length[1]  # cos 120 degrees = -0.5
+    return len(runs(is_reversal & (np.minimum(*length) >= _REVERSAL_M)))
 
 
 def _touching(touching: np.ndarray) -> dict[str, float]:
     frames = np.flatnonzero(touching.any(axis=0))
     span = touching[:, frames[0] : frames[-1] + 1] if len(frames) else touching[:, :0]
     quarter = -(-span.shape[1] // 4)
-    first, last = (own.sum(axis=1) * 2 >= max(quarter, 1) for own in (span[:, :quarter], span[:, -quarter:]))
-    sides = {
-        f"{name}_{side}": float(own[row])
-        for name, own in (("first", first), ("last", last))
-        for row, side in enumerate(SIDES)
+    first, last = (part.sum(axis=1) * 2 >= max(quarter, 1) for part in (span[:, :quarter], span[:, -quarter:]))
+    grasps = {
+        f"{name}_{side}": float(is_grasping[hand])
+        for name, is_grasping in (("first", first), ("last", last))
+        for hand, side in enumerate(SIDES)
     }
-    return sides | {"hand_changes": float((first != last).sum())}
+    return grasps | {"hand_changes": float((first != last).sum())}
 
 
 @dataclass(frozen=True)
 class Actions:
-    """What the verbs of a dataset ask of a motion.
+    """Limits, usual ranges and centroids of the measures, by verb of a dataset."""
 
-    limits: of every verb that has any, by number. learnt: how many training clips a verb's limits are learnt from; the
-    other verbs have theirs from ``actions.toml``. usual: bounds of every verb with ``LEAST_CLIPS`` clips, whether or
-    not it has limits in the file: from the 1st to the 99th percentile and ``MARGIN`` of its own deviations beyond, or
-    of all clips' where its own are ``ALIKE``; learnt limits are wider, always by ``MARGIN`` of all clips'. centroids:
-    by verb, the mean of its training clips' standardised numbers. scale: of each of these numbers its mean and standard
-    deviation over all training clips, the latter at least ``LEAST_DEVIATION``: in clean recordings some hardly differ,
-    and a prediction a little off is not far off.
-    """
+    limits: Mapping[str, Limits]  # by verb, limits that a motion of the verb satisfies
+    learnt: Mapping[str, int]  # number of clips for verbs with computed limits; other limits are from actions.toml
+    centroids: Mapping[str, np.ndarray]  # by verb, mean standardised measures of its training clips
+    scale: Mapping[str, tuple[float, float]]  # by measure, mean and deviation (``MIN_DEVIATION`` or more) of all clips
+    usual: Mapping[str, Limits] = field(default_factory=dict)  # by verb, ``usual_limits``
 
-    limits: Mapping[str, Limits]
-    learnt: Mapping[str, int]
-    centroids: Mapping[str, np.ndarray]
-    scale: Mapping[str, tuple[float, float]]
-    usual: Mapping[str, Limits] = field(default_factory=dict)
-
-    def followed(self, verb: str | None, numbers: Mapping[str, float]) -> bool | None:
-        """Whether a motion does what the verb says; None where nothing is known of the verb or of its numbers."""
+    def satisfies_limits(self, verb: str | None, numbers: Mapping[str, float]) -> bool | None:
+        """Whether a motion is within the verb's limits; None if the verb has no limits or a measure is NaN."""
         limits = self.limits.get(verb or "")
         return None if limits is None else _within(numbers, limits)
 
-    def named(self, numbers: Mapping[str, float]) -> str | None:
-        """The verb whose centroid is nearest; None where a number is not known or no verb has a centroid."""
-        asked = _standardised(numbers, self.scale)
-        if not self.centroids or np.isnan(asked).any():
+    def nearest_verb(self, numbers: Mapping[str, float]) -> str | None:
+        """Return the verb with the nearest centroid; None if a measure is NaN or no verb has a centroid."""
+        standardised = _standardised(numbers, self.scale)
+        if not self.centroids or np.isnan(standardised).any():
             return None
-        return min(self.centroids, key=lambda verb: float(np.linalg.norm(self.centroids[verb] - asked)))
+        return min(self.centroids, key=lambda verb: float(np.linalg.norm(self.centroids[verb] - standardised)))
 
     def unusual(self, verb: str, numbers: Mapping[str, float]) -> tuple[str, ...]:
-        """The numbers, in words, that lie outside the verb's ``usual`` bounds; none where it or they are not known."""
+        """Describe the measures outside of the verb's ``usual`` range."""
         limits = self.usual.get(verb, {})
-        said = (beside_usual(name, numbers[name], *limits[name]) for name in self.beyond(verb, numbers))
-        return tuple(filter(None, said))
+        texts = (describe_unusual(name, numbers[name], *limits[name]) for name in self.violations(verb, numbers))
+        return tuple(filter(None, texts))
 
-    def seen(self, verb: str, numbers: Mapping[str, float]) -> tuple[str, ...]:
-        """Those of ``unusual`` that a person who watches the motion sees."""
+    def visibly_unusual(self, verb: str, numbers: Mapping[str, float]) -> tuple[str, ...]:
+        """Describe the measures so far outside of the verb's ``usual`` range that a viewer notices."""
         limits = self.usual.get(verb, {})
-        seen = [name for name in self.beyond(verb, numbers) if is_seen(name, numbers[name], *limits[name])]
-        return tuple(filter(None, (beside_usual(name, numbers[name], *limits[name]) for name in seen)))
+        visible = [name for name in self.violations(verb, numbers) if is_visible(name, numbers[name], *limits[name])]
+        return tuple(filter(None, (describe_unusual(name, numbers[name], *limits[name]) for name in visible)))
 
-    def beyond(self, verb: str, numbers: Mapping[str, float]) -> dict[str, float]:
-        """By how much numbers lie outside the verb's ``usual`` bounds, in widths of these; without those inside."""
-        found = {
+    def violations(self, verb: str, numbers: Mapping[str, float]) -> dict[str, float]:
+        """Return the distance of each unusual measure from the verb's ``usual`` range, relative to its width."""
+        excess = {
             name: max(least - numbers[name], numbers[name] - most) / ((most - least) or 1.0)
             for name, (least, most) in self.usual.get(verb, {}).items()
         }
-        return {name: far for name, far in found.items() if far > 0}
+        return {name: relative for name, relative in excess.items() if relative > 0}
 
     @property
     def record(self) -> dict[str, Any]:
-        """What ``named`` and ``unusual`` need, as plain values."""
-        centroids = {verb: dict(zip(self.scale, own.tolist(), strict=True)) for verb, own in self.centroids.items()}
-        usual = {verb: {name: list(own) for name, own in limits.items()} for verb, limits in self.usual.items()}
-        scale = {name: list(own) for name, own in self.scale.items()}
+        """What ``nearest_verb`` and ``unusual`` need, as plain values."""
+        centroids = {verb: dict(zip(self.scale, mean.tolist(), strict=True)) for verb, mean in self.centroids.items()}
+        usual = {verb: {name: list(pair) for name, pair in limits.items()} for verb, limits in self.usual.items()}
+        scale = {name: list(pair) for name, pair in self.scale.items()}
         return {"scale": scale, "centroids": centroids, "usual": usual}
 
     @classmethod
     def read(cls, record: Mapping[str, Any]) -> "Actions":
-        """From a record; without limits, so that nothing is known of what follows a verb."""
+        """Build from a record. The result has no limits: ``satisfies_limits`` returns None for each verb."""
         scale = {name: (float(mean), float(deviation)) for name, (mean, deviation) in record["scale"].items()}
-        centroids = {verb: np.array([own[name] for name in scale]) for verb, own in record["centroids"].items()}
+        centroids = {verb: np.array([means[name] for name in scale]) for verb, means in record["centroids"].items()}
         usual = {
             verb: {name: (float(least), float(most)) for name, (least, most) in limits.items()}
             for verb, limits in record.get("usual", {}).items()
         }
-        return cls({}, {}, centroids, scale, usual)
+        return cls(limits={}, learnt={}, centroids=centroids, scale=scale, usual=usual)
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Where each verb's limits come from, for the file of figures."""
+        """The source of each verb's limits, for the metrics file."""
         return {"limits": sorted(set(self.limits) - set(self.learnt)), "learnt": dict(sorted(self.learnt.items()))}
 
 
 def training_actions(annotated: AnnotatedStore) -> Actions:
-    """The actions of an annotated dataset: of its training part alone, and of ``actions.toml``."""
+    """Compute the actions of a dataset from its training clips and ``actions.toml``."""
     numbers: dict[str, list[dict[str, float]]] = {}
     for clip_id in annotated.ids("train"):
         if verb := verb_of(annotated, clip_id):
@@ -286,7 +272,7 @@ def training_actions(annotated: AnnotatedStore) -> Actions:
 
 
 def verb_of(annotated: AnnotatedStore, clip_id: str) -> str | None:
-    """The verb of a clip, as it was annotated."""
+    """Return the annotated verb of a clip."""
     verb = annotated.hand_types.at[clip_id, "verb"]
     return verb if isinstance(verb, str) and verb else None
 
@@ -294,42 +280,58 @@ def verb_of(annotated: AnnotatedStore, clip_id: str) -> str | None:
 def learn_actions(
     numbers: Mapping[str, list[dict[str, float]]], written: Mapping[str, Limits] | None = None
 ) -> Actions:
-    """Actions of clips' numbers by verb. written: limits that take the place of learnt ones where the clips follow."""
-    every = [row for rows in numbers.values() for row in rows]
+    """Compute actions from the measures of clips.
+
+    Args:
+        numbers: by verb, ``action_numbers`` of each clip.
+        written: by verb, limits that replace computed ones if most of the verb's clips satisfy them.
+    """
+    all_clips = [clip for clips in numbers.values() for clip in clips]
     scale = {}
-    for name in LEARNT:
-        column = np.array([row[name] for row in every])
+    for name in VERB_MEASURES:
+        column = np.array([clip[name] for clip in all_clips])
         if len(column) and np.isfinite(column).all():
-            scale[name] = float(column.mean()), max(float(column.std()), LEAST_DEVIATION[name.rpartition("_")[2]])
+            scale[name] = float(column.mean()), max(float(column.std()), MIN_DEVIATION[name.rpartition("_")[2]])
     limits, learnt = dict[str, Limits](), dict[str, int]()
     usual = usual_limits(numbers, scale)
-    for verb, rows in numbers.items():
-        known = (written or {}).get(verb)
-        if known is not None and np.mean([_within(row, known) is True for row in rows]) >= SHARE_THAT_FOLLOWS:
-            limits[verb] = known
+    all_deviations = {name: deviation for name, (_, deviation) in scale.items()}
+    for verb, clips in numbers.items():
+        table = (written or {}).get(verb)
+        if table is not None and np.mean([_within(clip, table) is True for clip in clips]) >= MIN_FRACTION_WITHIN:
+            limits[verb] = table
         elif verb in usual:
-            limits[verb], learnt[verb] = _bands(rows, {name: own for name, (_, own) in scale.items()}), len(rows)
-    centroids = {verb: np.mean([_standardised(row, scale) for row in rows], axis=0) for verb, rows in numbers.items()}
-    return Actions(limits, learnt, centroids, scale, usual)
+            limits[verb], learnt[verb] = _bands(clips, all_deviations), len(clips)
+    centroids = {verb: np.mean([_standardised(clip, scale) for clip in clips], 0) for verb, clips in numbers.items()}
+    return Actions(limits=limits, learnt=learnt, centroids=centroids, scale=scale, usual=usual)
 
 
 def usual_limits(
     numbers: Mapping[str, list[dict[str, float]]], scale: Mapping[str, tuple[float, float]]
 ) -> dict[str, Limits]:
-    """Bounds of the numbers that ``scale`` names, of every verb with enough clips, as ``Actions.usual`` has them."""
-    return {verb: _bands(rows, _own(rows, scale)) for verb, rows in numbers.items() if len(rows) >= LEAST_CLIPS}
+    """Compute the usual range of each measure in ``scale``, by verb with ``MIN_CLIPS`` clips or more.
+
+    The range is the 1st to the 99th percentile, widened by ``MARGIN`` deviations of the verb's clips. If these hardly
+    differ, the deviation of all clips is used.
+    """
+    return {
+        verb: _bands(clips, _verb_deviations(clips, scale))
+        for verb, clips in numbers.items()
+        if len(clips) >= MIN_CLIPS
+    }
 
 
-def _own(rows: list[dict[str, float]], scale: Mapping[str, tuple[float, float]]) -> dict[str, float]:
-    """Deviations of a verb's own clips, which tell how often to shake; of all clips where its own are alike."""
-    found = {name: float(np.std([row[name] for row in rows])) for name in scale}
-    return {name: found[name] if found[name] > ALIKE * every else every for name, (_, every) in scale.items()}
+def _verb_deviations(clips: list[dict[str, float]], scale: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    deviations = {}
+    for name, (_, of_all_clips) in scale.items():
+        of_verb = float(np.std([clip[name] for clip in clips]))
+        deviations[name] = of_verb if of_verb > MIN_RELATIVE_DEVIATION * of_all_clips else of_all_clips
+    return deviations
 
 
-def _bands(rows: list[dict[str, float]], deviations: Mapping[str, float]) -> Limits:
+def _bands(clips: list[dict[str, float]], deviations: Mapping[str, float]) -> Limits:
     bands = {}
     for name, deviation in deviations.items():
-        low, high = np.percentile([row[name] for row in rows], (1, 99))
+        low, high = np.percentile([clip[name] for clip in clips], (1, 99))
         bands[name] = float(low - MARGIN * deviation), float(high + MARGIN * deviation)
     return bands
 
@@ -346,17 +348,17 @@ def _standardised(numbers: Mapping[str, float], scale: Mapping[str, tuple[float,
 
 @lru_cache(maxsize=1)
 def written_limits(path: Path = TABLE) -> dict[str, Limits]:
-    """The limits of ``actions.toml`` by verb; none without the file. Raises BadInput for anything else in it."""
+    """Read the limits of ``actions.toml`` by verb; {} without the file. Raises BadInput for an invalid table."""
     tables = tomllib.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     return {verb: _limits(f"{path.name}: {verb}", table) for verb, table in tables.items()}
 
 
-def _limits(where: str, table: Mapping[str, Any]) -> Limits:
-    named = {name: value for name, value in table.items() if name != "hands"}
+def _limits(source: str, table: Mapping[str, Any]) -> Limits:
+    limits_of = {name: value for name, value in table.items() if name != "hands"}
     if "hands" in table:
-        named["hand_changes"] = HANDS.get(table["hands"], ())
-    for name, limits in named.items():
-        if name not in NUMBERS or len(limits) != 2 or not limits[0] <= limits[1]:
-            expected = f"hands: {' or '.join(HANDS)}; [least, most] of any of {', '.join(NUMBERS)}"
-            raise BadInput(where, expected, f"{name} = {limits}", "correct the table")
-    return {name: (float(least), float(most)) for name, (least, most) in named.items()}
+        limits_of["hand_changes"] = HANDS.get(table["hands"], ())
+    for name, limits in limits_of.items():
+        if name not in MEASURES or len(limits) != 2 or not limits[0] <= limits[1]:
+            expected = f"hands: {' or '.join(HANDS)}; [least, most] of any of {', '.join(MEASURES)}"
+            raise BadInput(source, expected, f"{name} = {limits}", "correct the table")
+    return {name: (float(least), float(most)) for name, (least, most) in limits_of.items()}

@@ -1,1 +1,1 @@
-"""From a clip to its words: sentences, hand type, text features; and from a user's words back to the hand."""
+"""Sentences, hand type and text features of clips, and reading of prompts."""

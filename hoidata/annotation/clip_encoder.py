@@ -1,12 +1,12 @@
-"""CLIP ViT-B/32's text tower from a file of weights, through open_clip (optional extra ``hoidata[clip]``).
+"""The text tower of CLIP ViT-B/32 from a file of weights, through open_clip (optional extra ``hoidata[clip]``).
 
-Only the tower is built, and a sentence is encoded at its own length, at most 24 tokens: CLIP's attention is causal and
-features are read at the end-of-text token, so padding behind it changes nothing and costs most of the time. A prompt of
-the four forms has at most 17 tokens.
+Sentences are encoded without padding, at most 24 tokens. CLIP's attention is causal and the feature is that of the
+end-of-text token, so padding changes nothing and would cost most of the time. Sentences of our forms have at most 17
+tokens.
 
-A file of weights is a safetensors archive or a zip file of ``torch.save``. Its names may be those of open_clip,
+A file of weights is a safetensors archive or a zip file of ``torch.save``. Tensor names are those of open_clip,
 OpenAI (``transformer.resblocks.0.ln_1.weight``) or transformers (``text_model.encoder.layers.0.layer_norm1.weight``),
-below any prefix (``text.``, ``module.``, ``clip_model.``). Everything beside the text tower is never read.
+with any prefix (``text.``, ``module.``, ``clip_model.``). Only the text tower is read.
 """
 
 import sys
@@ -26,21 +26,24 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.files import sha256_file
 
 CONTEXT_TOKENS = 24
-# Of every CLIP text tower.
-HEAD_WIDTH = 64
+HEAD_WIDTH = 64  # of all CLIP text towers
 VIT_B_32 = (512, 12)
-# Keeps the stand-in operator names registered for as long as the process lives.
+# Keeps the declared operators registered for the lifetime of the process.
 _registered: list[torch.library.Library] = []
 
 
 class ClipEncoder:
-    """Un-normalised 512-d text features, as Text2HOI uses them.
+    """Un-normalised 512-d text features, as in Text2HOI.
 
-    weights: a ViT-B/32 state dict by the names of open_clip, OpenAI or transformers, whole or the text tower alone, in
-    safetensors or a zip file of ``torch.save``; or a tag of open_clip's. Towers of other width and depth are built as
-    their weights are, as long as they give 512 numbers. QuickGELU is right for OpenAI's weights, not for LAION's; a
-    wrong choice goes unnoticed by the network, so it is part of the identity.
-    Raises MissingResource when weights or open_clip are missing, BadInput when the file is not such a state dict.
+    Width and depth of the tower follow from the weights; the output must have 512 dimensions. OpenAI's weights need
+    QuickGELU, LAION's do not. A wrong choice raises no error, so QuickGELU is part of the identity.
+
+    Args:
+        weights: file with a CLIP state dict, or a tag of open_clip.
+
+    Raises:
+        MissingResource: weights or open_clip are missing.
+        BadInput: the file is not a CLIP state dict.
     """
 
     def __init__(self, weights: WeightsName) -> None:
@@ -63,7 +66,7 @@ class ClipEncoder:
         }
 
     def encode(self, sentences: Sequence[str]) -> np.ndarray:
-        """One sentence and one thread at a time: the last bits would depend on neighbours and number of threads."""
+        """Encode one sentence at a time in one thread, so that the last bits do not depend on batch and threads."""
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
@@ -81,10 +84,10 @@ class ClipEncoder:
 
 
 def import_open_clip() -> Any:
-    """open_clip, imported with PyPI's CUDA build of torchvision beside CPU torch as well.
+    """Import open_clip, also with a CUDA build of torchvision next to CPU torch.
 
-    That torchvision fails at import because two of its compiled operators are absent; CLIP's text tower uses neither,
-    so their names alone are declared.
+    Such a torchvision fails at import because two compiled operators are missing. CLIP's text tower uses neither, so
+    declaring their names is enough.
     """
     if "torchvision" not in sys.modules and not torch.cuda.is_available():
         _declare_torchvision_operators()
@@ -115,19 +118,19 @@ def _load_tower(open_clip: Any, weights: Path, quick_gelu: bool) -> Any:
         tower.load_state_dict(state)
     except RuntimeError as error:
         expected = f"the text tower of {ARCHITECTURE}"
-        raise BadInput(weights, expected, str(error)[:200], "give matching weights") from error
+        raise BadInput(weights, expected, str(error)[:200], "pass matching weights") from error
     return tower.eval()
 
 
 def _size(weights: Path, state: dict[str, torch.Tensor]) -> dict[str, int]:
-    """Width, heads and layers of a text tower, as its tensors have them."""
+    """Return width, heads and layers of a text tower from its tensors."""
     projection = state.get("text_projection", torch.zeros(0, 0))
     width = projection.shape[0]
     layers = {name.split(".")[2] for name in state if name.startswith("transformer.resblocks.")}
     if tuple(projection.shape) != (width, DIMENSIONS) or width < HEAD_WIDTH or width % HEAD_WIDTH or not layers:
         expected = f"a CLIP text tower that gives {DIMENSIONS} numbers"
         got = f"{len(layers)} layers, text_projection {tuple(projection.shape)}"
-        raise BadInput(weights, expected, got, "give matching weights")
+        raise BadInput(weights, expected, got, "pass matching weights")
     return {
         "context_length": CONTEXT_TOKENS,
         "width": width,
@@ -138,11 +141,11 @@ def _size(weights: Path, state: dict[str, torch.Tensor]) -> dict[str, int]:
 
 Tensors = dict[str, Tensor]
 ZIP_BYTES = b"PK\x03\x04"
-# The tensor by which a tower is found, and with it the prefix of all its tensors.
+# The tensor that identifies a text tower; the start of its name is the prefix of all tensors.
 OPEN_CLIP, TRANSFORMERS = "token_embedding.weight", "embeddings.token_embedding.weight"
 PROJECTION = "text_projection"
 NAMINGS = "a CLIP text tower by the names of open_clip, OpenAI or transformers"
-# Transformers' names, and open_clip's for the same tensor.
+# Parts of tensor names: transformers' to open_clip's.
 RENAMED = {
     "embeddings.token_embedding.": "token_embedding.",
     "embeddings.position_embedding.weight": "positional_embedding",
@@ -155,47 +158,49 @@ RENAMED = {
     ".self_attn.out_proj.": ".attn.out_proj.",
 }
 CONVERT = "write the weights' state_dict() as safetensors (docs/words.md says how)"
-# What stands beside the text tower in a whole model of open_clip or OpenAI.
-BESIDE = ("visual.", "logit_", "attn_mask", "input_resolution", "context_length", "vocab_size")
+# Prefixes of tensors outside of the text tower, in a whole model of open_clip or OpenAI.
+OTHER_TENSORS = ("visual.", "logit_", "attn_mask", "input_resolution", "context_length", "vocab_size")
 
 
 def read_tower(path: Path) -> Tensors:
-    """The text tower's tensors, float32, by open_clip's names. Raises BadInput for a file that holds none."""
+    """Read the tensors of a text tower, float32, with open_clip's names. Raises BadInput for a file without one."""
     names, load = _opened(path)
-    found = [name for name in names if f".{name}".endswith(f".{OPEN_CLIP}")]
-    if len(found) != 1:
-        got = f"{len(found)} of them" if found else f"tensors {', '.join(sorted(names)[:3])}"
-        raise BadInput(path, NAMINGS, got, "give the weights of one CLIP model")
-    is_transformers = found[0].endswith(TRANSFORMERS)
-    prefix = found[0].removesuffix(TRANSFORMERS if is_transformers else OPEN_CLIP)
+    embeddings = [name for name in names if f".{name}".endswith(f".{OPEN_CLIP}")]
+    if len(embeddings) != 1:
+        got = f"{len(embeddings)} towers" if embeddings else f"tensors {', '.join(sorted(names)[:3])}"
+        raise BadInput(path, NAMINGS, got, "pass the weights of one CLIP model")
+    is_transformers = embeddings[0].endswith(TRANSFORMERS)
+    prefix = embeddings[0].removesuffix(TRANSFORMERS if is_transformers else OPEN_CLIP)
     if is_transformers:
         return _of_transformers(path, names, load, prefix)
-    own = [name for name in names if name.startswith(prefix)]
-    own = [name for name in own if not name.startswith(tuple(prefix + part for part in BESIDE))]
-    return {name.removeprefix(prefix): load(name).float() for name in own}
+    others = tuple(prefix + part for part in OTHER_TENSORS)
+    tower = [name for name in names if name.startswith(prefix) and not name.startswith(others)]
+    return {name.removeprefix(prefix): load(name).float() for name in tower}
 
 
 def _of_transformers(path: Path, names: list[str], load: Callable[[str], Tensor], prefix: str) -> Tensors:
-    """The tensors of a tower below ``prefix``; its projection stands beside it, transposed."""
+    """Convert a tower of transformers: other names, separate q, k and v, and a transposed projection."""
     projection = f"{prefix.removesuffix('text_model.')}{PROJECTION}.weight"
     if projection not in names:
         remedy = "take the weights of a CLIPModel or a CLIPTextModelWithProjection"
         raise BadInput(path, f"{projection}, the last layer of the text tower", "a CLIPTextModel without it", remedy)
     parts = tuple(f"{prefix}{part}" for part in ("embeddings.", "encoder.", "final_layer_norm."))
-    own = {
+    theirs = {
         name.removeprefix(prefix): load(name).float()
         for name in names
         if name.startswith(parts) and not name.endswith("position_ids")
     }
-    attention = {name for name in own if name.rpartition(".")[0].endswith(("q_proj", "k_proj", "v_proj"))}
-    found = {_renamed(name): tensor for name, tensor in own.items() if name not in attention}
+    attention = {name for name in theirs if name.rpartition(".")[0].endswith(("q_proj", "k_proj", "v_proj"))}
+    converted = {_renamed(name): tensor for name, tensor in theirs.items() if name not in attention}
     for query in sorted(name for name in attention if ".q_proj." in name):
         layer, kind = query.split(".self_attn.q_proj.")
-        three = [own.get(query.replace("q_proj", part)) for part in ("q_proj", "k_proj", "v_proj")]
+        three = [theirs.get(query.replace("q_proj", part)) for part in ("q_proj", "k_proj", "v_proj")]
         if any(tensor is None for tensor in three):
             raise BadInput(path, f"{prefix}{layer}.self_attn: q_proj, k_proj and v_proj", "not all", "copy it again")
-        found[_renamed(f"{layer}.attn.in_proj_{kind}")] = torch.cat([own for own in three if own is not None])
-    return {**found, PROJECTION: load(projection).float().T.contiguous()}
+        converted[_renamed(f"{layer}.attn.in_proj_{kind}")] = torch.cat(
+            [tensor for tensor in three if tensor is not None]
+        )
+    return {**converted, PROJECTION: load(projection).float().T.contiguous()}
 
 
 def _renamed(name: str) -> str:
@@ -205,7 +210,7 @@ def _renamed(name: str) -> str:
 
 
 def _opened(path: Path) -> tuple[list[str], Callable[[str], Tensor]]:
-    """The names of a file's tensors, and what reads one of them."""
+    """Return the names of a file's tensors, and a function that reads one."""
     with path.open("rb") as file:
         is_zip = file.read(len(ZIP_BYTES)) == ZIP_BYTES
     if is_zip:
@@ -221,7 +226,7 @@ def _opened(path: Path) -> tuple[list[str], Callable[[str], Tensor]]:
 
 
 def _state_dict(path: Path) -> Tensors:
-    """The tensors by name of a zip file, also below "state_dict", as open_clip's trainings keep them."""
+    """Read the tensors of a zip file of ``torch.save``, at the top level or under "state_dict"."""
     expected = "a zip file of torch.save with weights alone"
     try:
         with ZipFile(path) as archive:
@@ -237,5 +242,5 @@ def _state_dict(path: Path) -> Tensors:
         raise BadInput(path, expected, text, CONVERT) from error
     if isinstance(stored, Mapping) and isinstance(stored.get("state_dict"), Mapping):
         stored = stored["state_dict"]
-    named = stored.items() if isinstance(stored, Mapping) else ()
-    return {name: tensor for name, tensor in named if isinstance(name, str) and isinstance(tensor, Tensor)}
+    items = stored.items() if isinstance(stored, Mapping) else ()
+    return {name: tensor for name, tensor in items if isinstance(name, str) and isinstance(tensor, Tensor)}

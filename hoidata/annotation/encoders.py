@@ -1,6 +1,6 @@
-"""Text encoders behind one interface: a sentence in, 512 numbers out, and an identity that says whose numbers they are.
+"""Text encoders: 512 features per sentence, and the identity of the encoder.
 
-Features of different encoders mean different things and are never mixed: the identity travels with every feature.
+Features of different encoders are incompatible, so the identity is stored with the features.
 """
 
 import hashlib
@@ -21,21 +21,24 @@ Identity = dict[str, str | int | bool]
 
 
 class TextEncoder(Protocol):
-    """``identity``: name, version, dims and sha256 of the weights (JSON types). Equal identity, equal features."""
+    """Interface of text encoders. Encoders with equal identities give equal features."""
 
-    identity: Identity
+    identity: Identity  # name, version, dims and sha256 of the weights
 
     def encode(self, sentences: Sequence[str]) -> np.ndarray:
-        """(sentence, 512) float32; each row depends on its own sentence alone."""
+        """Return (sentence, 512) float32 features. Each depends on its sentence only."""
         ...
 
 
 def load_encoder(name: str) -> TextEncoder:
-    """The encoder called ``use`` (offline default), ``hash`` (no semantics, for tests), ``clip:FILE`` or ``clip:TAG``.
+    """Load the encoder ``use`` (offline, default), ``hash`` (no semantics, for tests), ``clip:FILE`` or ``clip:TAG``.
 
-    ``clip:FILE.safetensors`` takes OpenAI's ViT-B/32; append ``?quick_gelu=false`` for weights trained with plain GELU
-    (LAION). ``clip:openai`` or another tag of open_clip's is looked for on this machine, then downloaded if online.
-    Raises BadInput for another name, MissingResource where a package or file is not there.
+    Append ``?quick_gelu=false`` to ``clip:FILE`` for weights trained with plain GELU (LAION). A tag of open_clip, such
+    as ``clip:openai``, is read from the local cache or downloaded.
+
+    Raises:
+        BadInput: the name is unknown.
+        MissingResource: a package or file is missing.
     """
     if name == "use":
         return CachedEncoder(UniversalSentenceEncoder())
@@ -68,7 +71,7 @@ class UniversalSentenceEncoder:
         }
 
     def encode(self, sentences: Sequence[str]) -> np.ndarray:
-        # The last bits of a feature depend on the neighbours in its batch and on the number of threads: one of both.
+        # One sentence, one thread: the last bits of a feature depend on its batch and on the number of threads.
         with self._threads.limit(limits=1, user_api="blas"):
             return _stack([self._model.encode(sentence) for sentence in sentences])
 
@@ -86,7 +89,7 @@ class HashEncoder:
 
 
 class CachedEncoder:
-    """Remembers the feature of every sentence it has seen; the cache belongs to one encoder, so nothing can mix."""
+    """Caches the features of an encoder by sentence."""
 
     def __init__(self, encoder: TextEncoder) -> None:
         self.identity = encoder.identity
@@ -99,11 +102,11 @@ class CachedEncoder:
         return _stack([self._features[text] for text in sentences])
 
 
-def refuse_other_encoder(where: str | Path, expected: Identity, got: Identity) -> None:
-    """Raise BadInput when two features come from different encoders."""
+def refuse_other_encoder(source: str | Path, expected: Identity, got: Identity) -> None:
+    """Raise BadInput if features come from different encoders."""
     if expected != got:
         raise BadInput(
-            where,
+            source,
             f"text features of {canonical_json(expected)}",
             canonical_json(got),
             "use one encoder for data and prompt: set annotate.encoder back, or annotate and train again",

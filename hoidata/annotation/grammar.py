@@ -1,17 +1,18 @@
-"""Word forms of verbs and objects: an explicit table first, rules for every other word.
+"""Word forms of verbs and objects, from tables and, for other words, from rules.
 
-``grammar.csv`` holds one row per word: kind (verb or object), base, gerund, past_participle, third_singular for verbs,
-noun_phrase and number (singular, plural or mass) for objects. Rules: lemminflect on the head word of an unknown verb;
-the first spoken sound for the article; the head noun's number, mass where ``mass_nouns.json`` lists it: substances and
-collections of everyday English, which no rule of spelling gives away.
+``grammar.csv`` has one row per word: kind (verb or object), base; gerund, past_participle and third_singular of verbs;
+noun_phrase and number (singular, plural or mass) of objects. For other words: lemminflect inflects the first word of a
+verb; the first sound decides the article; the head noun decides the number. ``mass_nouns.json`` lists mass nouns of
+everyday English.
 
-``phrases.csv`` holds what English says for a verb with an object, one kind per row; lists are divided by semicolons.
-noun: ``said`` for each of ``objects`` ("a pair of scissors"), {} being the object.
-contents: verbs of what a container holds; with them the object keeps its bare name ("pour milk").
-verb: ``said`` before each of ``objects`` (* is any), {} being the verb: "chop with", "look through". hand: "with" or
-"in" the hand. tool: "used" or "held", where the passive is "A knife is used by the right hand to chop". purpose: what
-follows that "to".
-synonym: another verb of the same meaning.
+``phrases.csv`` has idioms of a verb with an object, with lists divided by semicolons. Kinds of rows:
+
+- noun: ``said`` for each of ``objects``, {} is the object: "a pair of scissors".
+- contents: verbs that act on the contents; with them the object keeps its bare name: "pour milk".
+- verb: ``said`` before each of ``objects`` (* is any), {} is the verb: "chop with", "look through". hand: preposition
+  of the hand, "with" or "in". tool: "used" or "held", as in "A knife is used by the right hand to chop". purpose: the
+  words after that "to".
+- synonym: another verb of the same meaning.
 """
 
 import csv
@@ -30,7 +31,7 @@ Number = Literal["singular", "plural", "mass"]
 DETERMINERS = frozenset(
     ("a", "an", "the", "this", "that", "these", "those", "my", "your", "his", "her", "its", "our", "their", "some")
 )
-# Words that start with a vowel letter but a consonant sound, and the other way round.
+# Words that start with a vowel letter but a consonant sound, and vice versa.
 CONSONANT_SOUND = re.compile(r"(?:eu|ew|uni(?!n|m)|one(?:\b|-)|once|ouija|u[bcfhjkqrst][aeiou])", re.IGNORECASE)
 SILENT_H = re.compile(r"(?:hour|honest|honou?r|heir|herb)", re.IGNORECASE)
 VOWEL_NUMBER = re.compile(r"(?:8|11(?!\d)|18(?!\d))")
@@ -62,7 +63,7 @@ class VerbForms:
 
 @dataclass(frozen=True)
 class NounPhrase:
-    """One object as it stands in a sentence: ``a book``, ``scissors``, ``milk``; number rules the verb's form."""
+    """An object in a sentence: ``a book``, ``scissors``, ``milk``. The verb agrees with ``number``."""
 
     base: str
     words: str
@@ -77,29 +78,29 @@ class Grammar:
     nouns: dict[str, NounPhrase]
 
     def verb(self, base: str) -> VerbForms:
-        """Forms of ``base`` (``hand over``). Raises BadInput when it holds no word."""
+        """Return the forms of ``base`` (``hand over``). Raises BadInput if it has no word."""
         base = _words(base, "verb")
-        known = self.verbs.get(base) or self.verbs.get(base.lower())
-        if known is None:
-            logger.warning("verb %r is not in the grammar table; its forms are made by rule", base)
-        return known or inflect_verb(base)
+        listed = self.verbs.get(base) or self.verbs.get(base.lower())
+        if listed is None:
+            logger.warning("verb %r is not in the grammar table; its forms follow a rule", base)
+        return listed or inflect_verb(base)
 
     def noun(self, base: str) -> NounPhrase:
-        """Phrase of ``base`` (``large cube``), with its article. Raises BadInput when it holds no word."""
+        """Return the phrase of ``base`` (``large cube``) with its article. Raises BadInput if it has no word."""
         base = _words(base, "object")
-        known = self.nouns.get(base) or self.nouns.get(base.lower())
-        if known:
-            return known
+        listed = self.nouns.get(base) or self.nouns.get(base.lower())
+        if listed:
+            return listed
         number = self._number_by_rule(base)
         bare = number != "singular" or base.split()[0].lower() in DETERMINERS
         return NounPhrase(base, base if bare else f"{article(base)} {base}", number)
 
     def _number_by_rule(self, base: str) -> Number:
-        """The number of the head noun: the last word, or the last one before "of"."""
+        """Return the number of the head noun: the last word, or the last word before "of"."""
         head = re.split(r"\s+of\s+", base)[0].split()[-1]
-        known = self.nouns.get(head) or self.nouns.get(head.lower())
-        if known:
-            return known.number
+        listed = self.nouns.get(head) or self.nouns.get(head.lower())
+        if listed:
+            return listed.number
         if head.lower() in mass_nouns():
             return "mass"
         plural = head.lower().endswith("s") and len(head) > 3 and not SINGULAR_IN_S.search(head)
@@ -108,20 +109,22 @@ class Grammar:
 
 @lru_cache(maxsize=4096)
 def inflect_verb(base: str) -> VerbForms:
-    """Forms of a verb outside the table: its first word inflected, the rest kept (``zip up``).
+    """Inflect the first word of a verb that is not in the table (``zip up``).
 
-    lemminflect's dictionary knows some 20,000 verbs, irregular ones among them; any other is taken for regular.
+    lemminflect's dictionary has some 20,000 verbs, including irregular ones; others are treated as regular.
     """
     from lemminflect import getInflection
 
     head, _, rest = base.partition(" ")
     listed = [getInflection(head, tag=tag, inflect_oov=False) for tag in ("VBG", "VBN", "VBZ")]
-    forms = [found[0] if found else regular for found, regular in zip(listed, regular_forms(head), strict=True)]
+    forms = [
+        irregular[0] if irregular else regular for irregular, regular in zip(listed, regular_forms(head), strict=True)
+    ]
     return VerbForms(base, *(f"{form} {rest}".rstrip() for form in forms))
 
 
 def regular_forms(verb: str) -> tuple[str, str, str]:
-    """Gerund, past participle and third person of a regular verb: ``clipping``, ``clipped``, ``clips``."""
+    """Return gerund, past participle and third person of a regular verb: ``clipping``, ``clipped``, ``clips``."""
     third = verb + ("es" if SIBILANT.search(verb) else "s")
     if CONSONANT_Y.search(verb):
         return verb + "ing", verb[:-1] + "ied", verb[:-1] + "ies"
@@ -133,7 +136,7 @@ def regular_forms(verb: str) -> tuple[str, str, str]:
 
 
 def article(noun: str) -> Literal["a", "an"]:
-    """ "a" or "an" by the first sound of ``noun``: an hour, a unicycle, an SD card, a USB stick, an 8-sided die."""
+    """Return "a" or "an" by the first sound of ``noun``: an hour, a unicycle, an SD card, an 8-sided die."""
     first = re.split(r"[\s-]", noun.strip())[0]
     letters = re.sub(r"[^A-Za-z]", "", first)
     if letters and letters.isupper() and (len(letters) == 1 or len(letters) <= 4):
@@ -145,32 +148,32 @@ def article(noun: str) -> Literal["a", "an"]:
 
 @dataclass(frozen=True)
 class Phrase:
-    """What English says for a verb with one object; see the module's text. said: the verb up to the object."""
+    """The idiom of a verb with one object (``phrases.csv``)."""
 
-    said: VerbForms
-    hand: str = "with"
-    tool: str = ""
-    purpose: str = ""
+    said: VerbForms  # the words before the object: "look through"
+    hand: str = "with"  # preposition of the hand
+    tool: str = ""  # "used" or "held" if the object is an instrument
+    purpose: str = ""  # "chop", as in "is used by the right hand to chop"
 
 
 @dataclass(frozen=True)
 class Phrases:
-    """``phrases.csv``. verbs: by verb and object, "*" for any object. nouns: pattern by object."""
+    """The idioms of ``phrases.csv``."""
 
-    verbs: dict[tuple[str, str], Phrase]
-    nouns: dict[str, str]
-    contents: frozenset[str]
+    verbs: dict[tuple[str, str], Phrase]  # by verb and object, "*" for any object
+    nouns: dict[str, str]  # pattern by object
+    contents: frozenset[str]  # verbs that act on the contents of a container
     synonyms: dict[str, str]
 
     def verb(self, forms: VerbForms, base: str) -> Phrase:
-        """The phrase of a verb with an object; "cut with" and the like name the instrument they are done with."""
-        found = self.verbs.get((forms.base, base)) or self.verbs.get((forms.base, "*"))
-        if not found and forms.base.endswith(" with"):
+        """Return the idiom of a verb with an object. The object of "cut with" and the like is an instrument."""
+        listed = self.verbs.get((forms.base, base)) or self.verbs.get((forms.base, "*"))
+        if not listed and forms.base.endswith(" with"):
             return Phrase(forms, "in", "used", forms.base.removesuffix(" with"))
-        return found or Phrase(forms)
+        return listed or Phrase(forms)
 
     def noun(self, noun: NounPhrase, verb: str) -> NounPhrase:
-        """The object as it is called when a hand handles it: "a carton of milk", but "pour milk"."""
+        """Return the noun phrase of an object with a verb: "lift a carton of milk", but "pour milk"."""
         if noun.base not in self.nouns or verb in self.contents:
             return noun
         return NounPhrase(noun.base, self.nouns[noun.base].format(noun.base), "singular")
@@ -178,22 +181,22 @@ class Phrases:
 
 @lru_cache(maxsize=1)
 def default_phrases() -> Phrases:
-    """The phrases shipped with the package."""
+    """Read the phrases shipped with the package."""
     rows: dict[str, list[dict[str, str]]] = {"noun": [], "contents": [], "verb": [], "synonym": []}
-    for row in _rows("phrases.csv"):
-        rows[row["kind"]].append(row)
-    verbs = {
-        (verb, name): Phrase(_said(row["said"].format(verb)), row["hand"], row["tool"], row["purpose"].format(verb))
-        for row in rows["verb"]
-        for verb, name in product(row["verb"].split(";"), row["objects"].split(";"))
-    }
-    nouns = {name: row["said"] for row in rows["noun"] for name in row["objects"].split(";")}
-    contents = frozenset(verb for row in rows["contents"] for verb in row["verb"].split(";"))
-    return Phrases(verbs, nouns, contents, {row["verb"]: row["said"] for row in rows["synonym"]})
+    for entry in _rows("phrases.csv"):
+        rows[entry["kind"]].append(entry)
+    verbs = {}
+    for entry in rows["verb"]:
+        for verb, name in product(entry["verb"].split(";"), entry["objects"].split(";")):
+            verb_forms, purpose = _inflected(entry["said"].format(verb)), entry["purpose"].format(verb)
+            verbs[verb, name] = Phrase(verb_forms, hand=entry["hand"], tool=entry["tool"], purpose=purpose)
+    nouns = {name: entry["said"] for entry in rows["noun"] for name in entry["objects"].split(";")}
+    contents = frozenset(verb for entry in rows["contents"] for verb in entry["verb"].split(";"))
+    return Phrases(verbs, nouns, contents, synonyms={entry["verb"]: entry["said"] for entry in rows["synonym"]})
 
 
-def _said(words: str) -> VerbForms:
-    """Forms of a phrase by those of its first word: "looking through"."""
+def _inflected(words: str) -> VerbForms:
+    """Inflect the first word of a phrase: "looking through"."""
     verbs, (head, _, rest) = default_grammar().verbs, words.partition(" ")
     if words in verbs:
         return verbs[words]
@@ -203,26 +206,26 @@ def _said(words: str) -> VerbForms:
 
 @lru_cache(maxsize=1)
 def default_grammar() -> Grammar:
-    """The table shipped with the package: every verb and object of H2O, GRAB and ARCTIC, and common others."""
+    """Read the table shipped with the package: verbs and objects of H2O, GRAB and ARCTIC, and common others."""
     rows = _rows("grammar.csv")
     forms = ("base", "gerund", "past_participle", "third_singular")
-    verbs = {row["base"]: VerbForms(*(row[name] for name in forms)) for row in rows if row["kind"] == "verb"}
+    verbs = {entry["base"]: VerbForms(*(entry[name] for name in forms)) for entry in rows if entry["kind"] == "verb"}
     nouns = {
-        row["base"]: NounPhrase(row["base"], row["noun_phrase"], cast(Number, row["number"]))
-        for row in rows
-        if row["kind"] == "object"
+        entry["base"]: NounPhrase(entry["base"], entry["noun_phrase"], cast(Number, entry["number"]))
+        for entry in rows
+        if entry["kind"] == "object"
     }
     return Grammar(verbs, nouns)
 
 
 @lru_cache(maxsize=1)
 def mass_nouns() -> frozenset[str]:
-    """Nouns that take no article and a singular verb: water, bread, luggage."""
+    """Return the nouns without article and with a singular verb: water, bread, luggage."""
     return frozenset(json.loads(_text("mass_nouns.json")))
 
 
 def _rows(table: str) -> list[dict[str, str]]:
-    """The rows of one of this package's tables."""
+    """Read a table of this package."""
     return list(csv.DictReader(_text(table).splitlines()))
 
 

@@ -1,11 +1,11 @@
-"""Which hand a prompt asks for: rules first, similarity with a margin second, a counted prior or "unknown" last.
+"""Finds the hand that a prompt requests: by rules, then by text similarity with a margin, then by a prior.
 
-Text2HOI (Sec. 4.1) always takes the most similar of three templates. That invents a hand for every sentence that names
-none, so it is kept apart as :func:`most_similar_hand`.
+Text2HOI (Sec. 4.1) always takes the most similar of three templates, which also gives a hand to sentences without one.
+:func:`most_similar_hand` does the same.
 
-"Left" and "right" count only as hands ("with your left", "LH", "left-handed", "the right holds it"), never as places
-("cup on the left", "right-hand drawer"), verbs ("he left it") or adverbs ("right away"). Order matters: what looks
-alike is blanked first, then what is negated, then mentions are collected.
+"Left" and "right" count only as hands ("with your left", "LH", "left-handed", "the right holds it"), not as positions
+("cup on the left", "right-hand drawer"), verbs ("he left it") or adverbs ("right away"). The order matters: phrases
+that only look like hands are blanked first, then negated hands, then mentions are collected.
 """
 
 import re
@@ -25,7 +25,7 @@ TEMPLATES: dict[HandType, str] = {
     "right": "A photo of right hand",
     "both": "A photo of both hands",
 }
-# Per encoder: the phrase it tells hands apart by best, and the cosine margin below which it is guessing.
+# The phrases by which the encoders distinguish hands best, and the cosine margin below which the result is random.
 PHRASES: dict[HandType, str] = {"left": "with the left hand", "right": "with the right hand", "both": "with both hands"}
 MARGIN = 0.05
 Source = Literal["rule", "embedding", "prior", "unknown"]
@@ -34,26 +34,23 @@ Method = Literal["rules", "similarity"]
 
 @dataclass(frozen=True)
 class HandChoice:
-    """hand: None when the sentence does not determine one and no prior was given (source "unknown").
+    """The hand that a prompt requests."""
 
-    source: what decided. confidence: 1 for a rule, the cosine margin for "embedding", the share for "prior", 0 for
-    "unknown". evidence: the words or numbers it rests on.
-    """
-
-    hand: HandType | None
-    source: Source
-    confidence: float
-    evidence: str
+    hand: HandType | None  # None if neither the prompt nor a prior determines it
+    source: Source  # what decided
+    confidence: float  # 1 for "rule", cosine margin for "embedding", fraction for "prior", 0 for "unknown"
+    evidence: str  # the words or numbers behind the decision
 
 
 def select_hand(
     text: str, encoder: TextEncoder | None = None, prior: Mapping[HandType, float] | None = None
 ) -> HandChoice:
-    """The hand an English prompt asks for.
+    """Find the hand that an English prompt requests.
 
-    encoder: asked only when the rules are silent, yet words for a hand and for a side are left; its answer counts
-    from a margin of 0.05.
-    prior: share of each hand type, say from ``hand_prior``; used last, and named as the source.
+    Args:
+        text: the prompt.
+        encoder: used if no rule applies but the prompt has words for a hand and a side; needs a margin of 0.05.
+        prior: fraction of each hand type in the training clips; used last.
     """
     mentions = find_mentions(text)
     evidence = "; ".join(mentions.evidence) or "no hand is named"
@@ -65,27 +62,25 @@ def select_hand(
         if margin >= MARGIN:
             return HandChoice(hand, "embedding", margin, f"most like {PHRASES[hand]!r} by {margin:.3f}")
     if prior:
-        hand, share = _most_likely(prior, mentions)
-        return HandChoice(hand, "prior", share, f"{evidence}; {hand} in {share:.0%} of the training clips")
+        hand, fraction = _most_likely(prior, mentions)
+        return HandChoice(hand, "prior", fraction, f"{evidence}; {hand} in {fraction:.0%} of the training clips")
     return HandChoice(None, "unknown", 0.0, evidence)
 
 
 def choose_hand(
     text: str, encoder: TextEncoder, prior: Mapping[HandType, float] | None = None, method: Method = "rules"
 ) -> HandChoice:
-    """``select_hand``; or by "similarity" the paper's plain way: always the most similar of three templates."""
+    """Call ``select_hand``, or with "similarity" take the most similar of three templates, as the paper does."""
     if method == "rules":
         return select_hand(text, encoder, prior)
     hand, margin = most_similar_hand(text, encoder)
-    return HandChoice(
-        hand, "embedding", margin, f"most like {TEMPLATES[hand]!r} by {margin:.3f}; no margin is asked for"
-    )
+    return HandChoice(hand, "embedding", margin, f"most like {TEMPLATES[hand]!r} by {margin:.3f}; any margin counts")
 
 
 def most_similar_hand(
     text: str, encoder: TextEncoder, templates: Mapping[HandType, str] = TEMPLATES
 ) -> tuple[HandType, float]:
-    """The template with the highest cosine similarity, as in the paper, and its lead over the second."""
+    """Return the template with the highest cosine similarity, as in the paper, and its margin over the second."""
     features = encoder.encode([text, *(templates[hand] for hand in HAND_TYPES)])
     features = features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)
     cosines = features[1:] @ features[0]
@@ -105,15 +100,15 @@ def _by_rule(mentions: "Mentions") -> HandType | None:
 
 
 def _is_cue(mentions: "Mentions") -> bool:
-    """Similarity alone answers every sentence; it is asked only where the words for an answer are there."""
+    """Whether the rest of the sentence mentions hand and side. Without them, similarity gives a random answer."""
     undecided = mentions.denied or mentions.one or mentions.either or mentions.both
     return not undecided and bool(HAND_WORD.search(mentions.rest) and SIDE_WORD.search(mentions.rest))
 
 
 def _most_likely(prior: Mapping[HandType, float], mentions: "Mentions") -> tuple[HandType, float]:
-    """The likeliest hand type the sentence does not rule out; ties go to left, then right."""
-    ruled_out = set(mentions.denied) | ({"both"} if mentions.one or mentions.denied & set(SIDES) else set())
-    allowed: list[HandType] = [hand for hand in HAND_TYPES if hand not in ruled_out] or list(HAND_TYPES)
+    """Return the most likely hand type that the sentence does not exclude; ties go to left, then right."""
+    excluded = set(mentions.denied) | ({"both"} if mentions.one or mentions.denied & set(SIDES) else set())
+    allowed: list[HandType] = [hand for hand in HAND_TYPES if hand not in excluded] or list(HAND_TYPES)
     best = max(allowed, key=lambda hand: prior.get(hand, 0.0))
     total = sum(prior.get(hand, 0.0) for hand in allowed)
     return best, prior.get(best, 0.0) / total if total else 1 / len(allowed)
@@ -125,16 +120,18 @@ _POSSESSIVE = r"(?:(?:your|my|his|her|their|its|our|one's)\s+)"
 _SIDE = r"(?P<side>left|right)"
 _ADJECTIVE = r"(?:(?:gloved|bare|free|dominant|own|open|closed|other|stronger|weaker|outstretched)\s+)?"
 _PART = r"(?:hands?|palms?|fists?|arms?|fingers?|fingertips?|thumbs?|(?:index|middle|ring|little)\s+fingers?)"
-# After a bare "left" or "right" none of these is a noun, so the side stands for a hand.
+# None of these words after a bare "left" or "right" is a noun, so the side means a hand.
 _CLAUSE_END = (
     r"(?=\s*(?:$|[.,;:!?¤)]|(?:and|to|then|only|alone|while|but|not|now|please|again|for|as|with|when|instead|because|"
     r"before|after|from|until|first|rather|if|or|on|this\s+time|\w+ly)\b))"
 )
-_PLACE_NOUN = (
+_LOCATION_NOUN = (
     r"(?:side|drawer|door|corner|edge|shelf|column|lane|part|half|end|one|panel|pocket|margin|page|knob|handle|"
     r"button|cup|mug|box|bottle|shoe|glove|lens|wall|cupboard|compartment|wheel|key|speaker|seat|window)\b"
 )
-_MADE_FOR = r"(?:scissors|mouse|mug|knife|guitar|tools?|screws?|threads?|version|model|desk|gloves?|bat|club|opener)\b"
+_HANDED_TOOL = (
+    r"(?:scissors|mouse|mug|knife|guitar|tools?|screws?|threads?|version|model|desk|gloves?|bat|club|opener)\b"
+)
 _MENTION = rf"{_SIDE}(?:\s+|-)?{_ADJECTIVE}{_PART}\b"
 _BOTH = (
     rf"(?:both\s+(?:of\s+)?{_DET}?(?:\w+\s+)?(?:hands?|palms|arms|fists)|both\s+(?:the\s+)?left\s+and\s+(?:the\s+)?right|"
@@ -153,9 +150,9 @@ LOOKALIKES = tuple(
     for pattern in (
         r"\bon\s+the\s+(?:other|one)\s+hand\s*,",
         r"\b(?:model|toy|robot|robotic|prosthetic|mannequin|plastic|wooden|rubber)\s+hands?\b",
-        rf"\b(?:left|right)(?:\s+|-)?hand\s+{_PLACE_NOUN}",
+        rf"\b(?:left|right)(?:\s+|-)?hand\s+{_LOCATION_NOUN}",
         r"\b(?:left|right)-hand\s+(?!grip|grasp|hold|only|alone|thumb|finger|palm|and\b|to\b|then\b|while\b|but\b)\w+",
-        rf"\b(?:left|right|one|two)(?:\s+|-)?handed\s+{_MADE_FOR}",
+        rf"\b(?:left|right|one|two)(?:\s+|-)?handed\s+{_HANDED_TOOL}",
         r"\b(?:left\s+(?:to|and|or|-)\s*right|right\s+(?:to|and|or|-)\s*left)\b(?!\s+(?:hand|palm|arm|fist))",
         r"\b(?:left|right)(?:most|over|overs|ward|wards|ful|fully|ly)\b",
         r"\bright\s+(?:away|now|after|before|next|there|here|angles?|then|back)\b",
@@ -181,7 +178,7 @@ _DENIED = (
     rf"(?P<bare>left|right){_CLAUSE_END})"
 )
 NEGATED = (re.compile(rf"{_NOT}{_LOOSE}{_DENIED}"), re.compile(rf"{_NOT_NEAR}{_TIGHT}{_DENIED}"))
-# A hand that receives or lies somewhere does not tell which one acts.
+# A hand that receives an object, or is a location, is not the active hand.
 PLACED = re.compile(
     rf"\b(?:on|onto|near|beside|behind|under|above|towards?|(?:left|right|top|front|side|next|close)\s+(?:of|to))\s+"
     rf"{_DET}?{_MENTION}"
@@ -216,55 +213,55 @@ INDEFINITE_HAND = re.compile(r"\ban?\s+hand\b")
 
 @dataclass
 class Mentions:
-    """What a sentence says of hands. sides, both: acting; denied: ruled out; one: a single hand, side not said."""
+    """The mentions of hands in a sentence."""
 
-    sides: set[Side] = field(default_factory=set)
+    sides: set[Side] = field(default_factory=set)  # active sides
     both: bool = False
-    denied: set[str] = field(default_factory=set)
-    one: bool = False
+    denied: set[str] = field(default_factory=set)  # negated hands
+    one: bool = False  # a single hand without a side
     either: bool = False
-    evidence: list[str] = field(default_factory=list)
-    rest: str = ""
+    evidence: list[str] = field(default_factory=list)  # the words
+    rest: str = ""  # the sentence without them
 
 
 def find_mentions(text: str) -> Mentions:
-    """Read the hand mentions of an English sentence; ``rest`` is what is left of it, lower case."""
-    found = Mentions()
+    """Find the mentions of hands in an English sentence."""
+    mentions = Mentions()
     rest = _normalised(text)
     for pattern in LOOKALIKES:
         rest = pattern.sub(BLANK, rest)
     if EITHER.search(rest):
-        found.either = True
+        mentions.either = True
         rest = EITHER.sub(BLANK, rest)
     for pattern in NEGATED:
-        rest = _take(pattern, rest, lambda match: found.denied.add(_denied(match)), found)
+        rest = _take(pattern, rest, lambda match: mentions.denied.add(_denied(match)), mentions)
     for pattern in (HANDED, OTHER_HAND, *HANDS):
-        rest = _take(pattern, rest, lambda match: setattr(found, "both", True), found)
+        rest = _take(pattern, rest, lambda match: setattr(mentions, "both", True), mentions)
     rest = RECEIVING.sub(BLANK, PLACED.sub(BLANK, rest))
     for pattern in (*SIDE_PATTERNS, _subject_pattern()):
-        rest = _take(pattern, rest, lambda match: found.sides.add(_side(match)), found)
-    rest = _take(ONE, rest, lambda match: setattr(found, "one", True), found)
-    if found.one and not found.sides:
-        rest = _take(_AFTER_ONE, rest, lambda match: found.sides.add(_side(match)), found)
-    found.rest = INDEFINITE_HAND.sub(BLANK, rest)
-    return found
+        rest = _take(pattern, rest, lambda match: mentions.sides.add(_side(match)), mentions)
+    rest = _take(ONE, rest, lambda match: setattr(mentions, "one", True), mentions)
+    if mentions.one and not mentions.sides:
+        rest = _take(_AFTER_ONE, rest, lambda match: mentions.sides.add(_side(match)), mentions)
+    mentions.rest = INDEFINITE_HAND.sub(BLANK, rest)
+    return mentions
 
 
 _AFTER_ONE = re.compile(rf"¤\s*[,:(]\s*(?:namely\s+)?{_DET}?{_SIDE}\s*(?:$|[.,;!?)])")
 
 
 def _subject_pattern() -> re.Pattern[str]:
-    """ "The right grabs ...": a side as the subject of a known verb, at the start of a clause."""
+    """Match a side as the subject of a known verb at the start of a clause: "The right grabs ..."."""
     verbs = "|".join(sorted({re.escape(forms.third_singular.split()[0]) for forms in default_grammar().verbs.values()}))
     return re.compile(rf"(?:^|[,;.¤]|\b(?:while|and|then|as|but))\s*{_DET}{_SIDE}\s+(?:{verbs})\b")
 
 
-def _take(pattern: re.Pattern[str], text: str, record, found: Mentions) -> str:
-    """Blank every match after recording it, so that no later pattern reads the same words."""
+def _take(pattern: re.Pattern[str], text: str, record, mentions: Mentions) -> str:
+    """Record and blank each match, so that no later pattern matches the same words."""
 
     def replace(match: re.Match[str]) -> str:
         record(match)
-        found.evidence.append(" ".join(match.group().replace("¤", "").split()))
+        mentions.evidence.append(" ".join(match.group().replace("¤", "").split()))
         return BLANK
 
     return pattern.sub(replace, text)
@@ -283,20 +280,20 @@ def _denied(match: re.Match[str]) -> str:
 
 
 def _normalised(text: str) -> str:
-    """Lower case, plain quotes, dashes as commas, single spaces, slips of the keys in the four hand words mended."""
+    """Normalise case, quotes, dashes and spaces, and correct typing errors in words for hands and sides."""
     text = re.sub(r"\s*[—–]\s*", ", ", text.lower().replace("’", "'"))
     text = re.sub(r"\b([lr])\.\s?h\.", r"\1h", text)
-    return " ".join(re.sub(r"[a-z]+", lambda match: _SLIPS.get(match.group(), match.group()), text).split())
+    return " ".join(re.sub(r"[a-z]+", lambda match: _TYPOS.get(match.group(), match.group()), text).split())
 
 
-def _slips(word: str) -> set[str]:
-    """``word`` with two neighbouring letters swapped, or one letter doubled: never an English word for these four."""
+def _typos(word: str) -> set[str]:
+    """Return typing errors of ``word``: two letters swapped or one doubled. None is an English word."""
     swapped = {word[:i] + word[i + 1] + word[i] + word[i + 2 :] for i in range(len(word) - 1)}
     doubled = {word[: i + 1] + word[i:] for i in range(len(word))}
     return (swapped | doubled) - {word}
 
 
-# Dropped letters are listed: most of them ("had", "let", "and") are words.
-_SLIPS = {slip: word for word in ("left", "right", "both", "hand", "hands") for slip in _slips(word)} | {
+# Dropped letters are listed, because most ("had", "let", "and") give other words.
+_TYPOS = {typo: word for word in ("left", "right", "both", "hand", "hands") for typo in _typos(word)} | {
     "rigt": "right", "rght": "right", "riht": "right", "bth": "both", "hnd": "hand", "hnds": "hands",
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Reading a user's prompt: which hand, which verb, which object."""
+"""Parses a prompt: hand, verb and object."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -17,17 +17,17 @@ HAND_PHRASE = re.compile(
     r"\busing\s+(?:(?:only|just)\s+)?(?:the|your|my|his|her|their|a|one)\s+(?:single\s+)?hand\b"
 )
 _RUN = re.compile(r"[\w-]+")
-# What stands before the verb in "A knife is used by the right hand to chop".
+# The words before the verb in "A knife is used by the right hand to chop".
 _PURPOSE = re.compile(r"\b(?:hold|holds|held|holding|use|uses|used|using)\b.*\bto $")
 
 
 @dataclass(frozen=True)
 class PromptReading:
-    """verb, object_words: base forms of the word table, None when no word of it is there."""
+    """Hand, verb and object of a prompt."""
 
     hand: HandChoice
-    verb: str | None
-    object_words: str | None
+    verb: str | None  # base form in the grammar table; None without a known word
+    object_words: str | None  # likewise
 
 
 @dataclass(frozen=True)
@@ -42,18 +42,21 @@ class _Match:
 
 @dataclass(frozen=True)
 class _Form:
-    """number: place in the lexicon; of two equally good readings the one that stands first there is taken."""
+    """A word form and its base form."""
 
-    number: int
+    number: int  # position in the lexicon; between equally good readings the first one wins
     words: str
     base: str
 
 
 class Lexicon:
-    """Surface forms of verbs and objects and the base form each stands for.
+    """Surface forms of verbs and objects, and their base forms.
 
-    verbs, nouns: lower-case form -> base form. A form that stands for two bases is refused (ValueError): a sentence
-    with it could not be read back.
+    Args:
+        verbs, nouns: pairs of a lower-case form and its base form.
+
+    Raises:
+        ValueError: a form has two base forms, so that it is ambiguous.
     """
 
     def __init__(self, verbs: Iterable[tuple[str, str]], nouns: Iterable[tuple[str, str]]) -> None:
@@ -61,11 +64,10 @@ class Lexicon:
         self._nouns = _Forms(nouns)
 
     def read(self, text: str) -> tuple[str | None, str | None]:
-        """Verb and object of a sentence, base forms.
+        """Find the verb and the object of a sentence, base forms.
 
-        Hand phrases are passed over. A verb after "to" is the action: "A knife is used to chop". Of all pairs of a
-        known verb form and a known noun that do not overlap, the pair that covers most of the sentence wins; among
-        equals the one whose verb stands first.
+        Hand phrases are skipped. A verb after "to" is the action: "A knife is used to chop". Among pairs of a verb and
+        a noun that do not overlap, the pair that covers most characters wins; between equal pairs, the first verb.
         """
         rest = " ".join(HAND_PHRASE.sub(" ¤ ", text.lower()).split())
         verbs, nouns = self._verbs.matches(rest), self._nouns.matches(rest)
@@ -79,7 +81,7 @@ class Lexicon:
 
 
 class _Forms:
-    """Word forms found by the run of letters, digits and hyphens they begin with: a look-up per word of the text."""
+    """Finds word forms in a text, indexed by their first word."""
 
     def __init__(self, forms: Iterable[tuple[str, str]]) -> None:
         bases: dict[str, str] = {}
@@ -92,16 +94,16 @@ class _Forms:
             self._by_start.setdefault(start[0] if start else "", []).append(_Form(number, words, base))
 
     def matches(self, text: str) -> list[_Match]:
-        """Whole words; places of one form do not overlap. In the order of the lexicon, then of the text."""
-        found: list[tuple[int, _Match]] = []
+        """Find whole words. Matches of one form do not overlap; sorted by position in the lexicon, then in the text."""
+        matches: list[tuple[int, _Match]] = []
         stops: dict[int, int] = {}
         for form, start in self._candidates(text):
             stop = start + len(form.words)
             whole = text.startswith(form.words, start) and not _RUN.match(text, stop)
             if whole and start >= stops.get(form.number, 0):
                 stops[form.number] = stop
-                found.append((form.number, _Match(form.base, start, stop)))
-        return [match for _, match in sorted(found, key=lambda entry: entry[0])]
+                matches.append((form.number, _Match(form.base, start, stop)))
+        return [match for _, match in sorted(matches, key=lambda entry: entry[0])]
 
     def _candidates(self, text: str) -> Iterator[tuple[_Form, int]]:
         for run in _RUN.finditer(text):
@@ -112,9 +114,9 @@ class _Forms:
 
 
 def grammar_lexicon(grammar: Grammar) -> Lexicon:
-    """Every form of the verbs of a grammar, and its objects without their articles.
+    """Build the lexicon of a grammar: all verb forms, and objects without articles.
 
-    Phrases ("look through" for see) and the reference's words stand for the same verbs and objects.
+    It includes idioms ("look through" for see) and the words of the reference implementation.
     """
     verbs = [(form, verb.base) for verb in grammar.verbs.values() for form in sorted(set(verb.forms))]
     verbs += [(form, base) for base, verb in ACTIONS.items() if base in grammar.verbs for form in verb.forms]
@@ -134,7 +136,7 @@ def _default_lexicon() -> Lexicon:
 
 
 def read_prompt(text: str, encoder: TextEncoder | None = None, grammar: Grammar | None = None) -> PromptReading:
-    """Hand type, verb and object of an English prompt, by the words of a grammar (see ``Lexicon.read``)."""
+    """Parse hand, verb and object of an English prompt with the words of a grammar (see ``Lexicon.read``)."""
     lexicon = _default_lexicon() if grammar is None else grammar_lexicon(grammar)
     verb, noun = lexicon.read(text)
     return PromptReading(select_hand(text, encoder), _labels().get((verb, noun), verb), noun)
@@ -142,7 +144,7 @@ def read_prompt(text: str, encoder: TextEncoder | None = None, grammar: Grammar 
 
 @lru_cache(maxsize=1)
 def _labels() -> dict[tuple[str | None, str | None], str]:
-    """The verb of a dataset that is said with another verb of the table: "put on" eyeglasses is "wear"."""
+    """Map idioms that equal another verb of the table to the verb they replace: "put on" eyeglasses is "wear"."""
     verbs = default_phrases().verbs
     return {
         (phrase.said.base, noun): verb

@@ -12,24 +12,19 @@ HandRule = Literal["proximity", "annotated-else-proximity"]
 
 @dataclass(frozen=True)
 class AnnotationSettings:
-    """encoder: a name for ``load_encoder``. threshold_m: a hand acts when a joint comes closer to the object than this.
+    """Settings of the stage annotate."""
 
-    threshold_m: None takes the contact stage's. hand: which hands are active: those that come so near, or the one the
-    source's annotator named, where one did (Text2HOI does so for ARCTIC), as long as some hand comes near. forms: the
-    paper's four sentences in our English, or as the reference implementation writes them. derive_verbs: a clip whose
-    source names no verb gets the one its motion shows; else its sentences say "move".
-    """
-
-    encoder: str = "use"
-    threshold_m: float | None = None
+    encoder: str = "use"  # a name for ``load_encoder``
+    threshold_m: float | None = None  # a hand with a closer joint is active; None: threshold of the contact stage
+    # Active hands: those close to the object, or the labelled hand if there is a label (Text2HOI does so for ARCTIC).
     hand: HandRule = "proximity"
-    forms: Forms = "paper"
-    derive_verbs: bool = True
+    forms: Forms = "paper"  # ``four_sentences`` or ``reference_sentences``
+    derive_verbs: bool = True  # derive a missing verb from the motion; False: the sentences say "move"
 
     def __post_init__(self) -> None:
         chosen = (("forms of the sentences", self.forms, Forms), ("annotate.hand", self.hand, HandRule))
-        for what, value, kind in chosen:
-            if value not in get_args(kind):
-                raise BadInput(what, " or ".join(get_args(kind)), repr(value), "choose one of them")
+        for setting, value, values in chosen:
+            if value not in get_args(values):
+                raise BadInput(setting, " or ".join(get_args(values)), repr(value), "choose one of them")
         if self.threshold_m is not None:
             check_threshold("annotate.threshold_m", self.threshold_m)

@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from hoidata.annotation.derived import derive_verb
 from hoidata.annotation.encoders import TextEncoder, load_encoder
-from hoidata.annotation.sentences import FORMS, FourSentences, four_sentences, reference_sentences
+from hoidata.annotation.sentences import FORMS, four_sentences, reference_sentences
 from hoidata.annotation.settings import AnnotationSettings
 from hoidata.clips import SIDES, Clip, HandType, Side
 from hoidata.contact.maps import acting_hands
@@ -51,15 +51,15 @@ HAND_TYPE_TABLE = pa.schema(
 
 
 class _Verb(NamedTuple):
-    """base: None for a clip without a verb, whose sentences say "move". source: where it is from, None without one."""
+    """The verb of a clip."""
 
-    base: str | None
+    base: str | None  # None: the sentences say "move"
     source: VerbSource | None
     evidence: str | None = None
 
 
 class _Hand(NamedTuple):
-    """active: the hand type; None where no hand comes near, and then it has no source."""
+    """The hand type of a clip; None, without a source, if no hand is close to the object."""
 
     active: HandType | None
     source: HandSource | None
@@ -67,14 +67,14 @@ class _Hand(NamedTuple):
 
 @dataclass(frozen=True)
 class _Annotated:
-    """One clip's result; without sentences, ``reason`` says why the clip is left out."""
+    """The annotation of one clip."""
 
     clip_id: str
     labelled_hand: HandType | None
     hand: _Hand
     evidence: HandEvidence
-    sentences: FourSentences | None
-    reason: str | None
+    sentences: tuple[str, ...] | None
+    reason: str | None  # why the clip is excluded, without sentences
     verb: _Verb
 
 
@@ -86,28 +86,37 @@ def annotate_store(
     contact: ContactSettings | None = None,
     encoder: str | TextEncoder | None = None,
     hands: HandPair | None = None,
-    left_out: Mapping[str, str] | None = None,
+    excluded: Mapping[str, str] | None = None,
     **changes: Any,
 ) -> dict[str, int]:
-    """Annotate every clip of the store; the folder appears whole or not at all.
+    """Annotate each clip of the store; the folder appears whole or not at all.
 
-    A hand is active when one of its joints comes closer than the threshold to one of the object's sampled points, or
-    by ``settings.hand`` when the annotator named it. Clips in which no hand comes near, or without a word for their
-    object, are listed with that reason and get no sentence.
-    settings, changes: fields of ``changes`` replace those of ``settings``. contact: of the stage contact, whose points
-    are looked at. encoder: a name for ``load_encoder`` or the encoder itself, in place of the settings'.
-    hands: as in ``open_store``. left_out: reasons of further clips that get no sentence, by clip id.
-    Returns counts: clips, annotated, left_out; by hand type left, right, both; sentences (distinct), labelled,
-    agreeing (with the hand that comes near), derived_verbs.
+    A hand is active if one of its joints is closer than the threshold to a sampled point of the object. With
+    ``settings.hand``, the annotator's label decides instead. Clips without an active hand, or without a word for
+    their object, have a reason and no sentence.
+
+    Args:
+        clips_folder: the store.
+        out_folder: folder to write.
+        settings: settings of the stage.
+        contact: settings of the stage contact, for the sampled points and the default threshold.
+        encoder: a text encoder or its name, instead of ``settings.encoder``.
+        hands: as in ``open_store``.
+        excluded: reasons of clips that get no sentence, by clip id.
+        changes: fields that replace those of ``settings``.
+
+    Returns:
+        Counts: clips, annotated, left_out; by hand type left, right, both; sentences (distinct), labelled, agreeing
+        (the labelled hand is the close one), derived_verbs.
     """
     settings, contact = replace(settings or AnnotationSettings(), **changes), contact or ContactSettings()
     threshold_m = contact.threshold_m if settings.threshold_m is None else settings.threshold_m
     encoder = settings.encoder if encoder is None else encoder
     encoder = load_encoder(encoder) if isinstance(encoder, str) else encoder
     store = open_store(clips_folder, hands)
-    found = _annotate_clips(store, threshold_m, contact.points, left_out or {}, _Writer(settings))
-    sentences = list(dict.fromkeys(text for item in found for text in item.sentences or ()))
-    counts = _counts(found, sentences)
+    annotated = _annotate_clips(store, threshold_m, contact.points, excluded or {}, _Writer(settings))
+    sentences = list(dict.fromkeys(text for item in annotated for text in item.sentences or ()))
+    counts = _counts(annotated, sentences)
     info = {
         "encoder": encoder.identity,
         "threshold_m": threshold_m,
@@ -117,9 +126,9 @@ def annotate_store(
         "counts": counts,
     }
     with atomic_folder(out_folder) as partial:
-        write_table(partial / "hand_type.parquet", [_hand_row(item) for item in found], HAND_TYPE_TABLE)
-        write_hand_distances(partial / "hand_distance.npz", [item.evidence for item in found])
-        write_table(partial / "text.parquet", _text_rows(found, sentences), TEXT_TABLE)
+        write_table(partial / "hand_type.parquet", [_hand_row(item) for item in annotated], HAND_TYPE_TABLE)
+        write_hand_distances(partial / "hand_distance.npz", [item.evidence for item in annotated])
+        write_table(partial / "text.parquet", _text_rows(annotated, sentences), TEXT_TABLE)
         _write_embeddings(partial / "embeddings.npz", encoder, sentences)
         (partial / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
     return counts
@@ -127,20 +136,20 @@ def annotate_store(
 
 @dataclass(frozen=True)
 class _Writer:
-    """How clips are put into words."""
+    """Derives hand type, verb and sentences of a clip."""
 
     settings: AnnotationSettings
 
     def hand(self, clip: Clip, evidence: HandEvidence) -> _Hand:
-        """The annotator's hand, if wanted and if it was tracked; else those that come near."""
-        named, near = clip.labelled_hand, evidence.hand_type
-        if near is None or named is None or self.settings.hand == "proximity":
-            return _Hand(near, near and "proximity")
-        tracked = all(clip.hands[side].valid.any() for side in SIDES if named in (side, "both"))
-        return _Hand(named, "annotated") if tracked else _Hand(near, "proximity")
+        """Return the labelled hand, if the settings prefer it and it is tracked, else the hands close to the object."""
+        labelled, close = clip.labelled_hand, evidence.hand_type
+        if close is None or labelled is None or self.settings.hand == "proximity":
+            return _Hand(close, close and "proximity")
+        tracked = all(clip.hands[side].valid.any() for side in SIDES if labelled in (side, "both"))
+        return _Hand(labelled, "annotated") if tracked else _Hand(close, "proximity")
 
     def verb(self, clip: Clip, evidence: HandEvidence) -> _Verb:
-        """The clip's own verb, else the one its motion shows, if wanted and if a hand acts."""
+        """Return the verb of the source, else the verb derived from the motion, if enabled and a hand is active."""
         if clip.verb is not None:
             return _Verb(clip.verb, "source")
         if not self.settings.derive_verbs or evidence.hand_type is None:
@@ -150,8 +159,8 @@ class _Writer:
 
     def sentences(
         self, clip: Clip, hand: HandType | None, evidence: HandEvidence
-    ) -> tuple[FourSentences | None, str | None]:
-        """The clip's sentences, or None and the reason."""
+    ) -> tuple[tuple[str, ...] | None, str | None]:
+        """Return the sentences, or None and the reason."""
         if hand is None:
             return None, _no_hand(evidence)
         write = four_sentences if self.settings.forms == "paper" else reference_sentences
@@ -162,31 +171,44 @@ class _Writer:
 
 
 def _annotate_clips(
-    store: Store, threshold_m: float, points: int, left_out: Mapping[str, str], writer: _Writer
+    store: Store, threshold_m: float, points: int, excluded: Mapping[str, str], writer: _Writer
 ) -> list[_Annotated]:
     indices = {name: ProximityIndex(cloud) for name, cloud in sample_objects(store, points).items()}
-    found = []
+    annotated = []
     for clip_id in store.ids:
         clip = store.clip(clip_id)
         joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
         evidence = acting_hands(clip, joints, indices[clip.object.model.name], threshold_m)
         hand, verb = writer.hand(clip, evidence), writer.verb(clip, evidence)
         clip = replace(clip, verb=verb.base)
-        words = (None, left_out[clip_id]) if clip_id in left_out else writer.sentences(clip, hand.active, evidence)
-        found.append(_Annotated(clip_id, clip.labelled_hand, hand, evidence, *words, verb))
-    return found
+        if clip_id in excluded:
+            sentences, reason = None, excluded[clip_id]
+        else:
+            sentences, reason = writer.sentences(clip, hand.active, evidence)
+        annotated.append(
+            _Annotated(
+                clip_id=clip_id,
+                labelled_hand=clip.labelled_hand,
+                hand=hand,
+                evidence=evidence,
+                sentences=sentences,
+                reason=reason,
+                verb=verb,
+            )
+        )
+    return annotated
 
 
 def _hand_row(item: _Annotated) -> dict:
     closest = {side: item.evidence.closest_m(side) for side in SIDES}
-    near, labelled = item.evidence.hand_type, item.labelled_hand
+    close, labelled = item.evidence.hand_type, item.labelled_hand
     return {
         "clip_id": item.clip_id,
         "hand_type": item.hand.active,
         "source": item.hand.source,
         **{f"min_{side}_m": distance if np.isfinite(distance) else None for side, distance in closest.items()},
         "labelled_hand": labelled,
-        "agreement": None if labelled is None else labelled == near,
+        "agreement": None if labelled is None else labelled == close,
         "reason": item.reason,
         "verb": item.verb.base,
         "verb_source": item.verb.source,
@@ -201,11 +223,11 @@ def _no_hand(evidence: HandEvidence) -> str:
     return f"no joint within {evidence.threshold_m * 100:g} cm of the object; nearest {nearest * 100:.1f} cm"
 
 
-def _text_rows(found: Sequence[_Annotated], sentences: Sequence[str]) -> list[dict]:
-    row_of = {sentence: row for row, sentence in enumerate(sentences)}
+def _text_rows(annotated: Sequence[_Annotated], sentences: Sequence[str]) -> list[dict]:
+    row_of = {sentence: number for number, sentence in enumerate(sentences)}
     return [
         {"clip_id": item.clip_id, "form": form, "sentence": sentence, "text_row": row_of[sentence]}
-        for item in found
+        for item in annotated
         if item.sentences
         for form, sentence in zip(FORMS, item.sentences, strict=True)
     ]
@@ -217,16 +239,16 @@ def _write_embeddings(path: Path, encoder: TextEncoder, sentences: Sequence[str]
     write_npz(path, {"features": encoder.encode(sentences), "sentences": text, "identity": identity})
 
 
-def _counts(found: Sequence[_Annotated], sentences: Sequence[str]) -> dict[str, int]:
-    hands = Counter(item.hand.active for item in found)
-    labelled = [item for item in found if item.labelled_hand]
+def _counts(annotated: Sequence[_Annotated], sentences: Sequence[str]) -> dict[str, int]:
+    hands = Counter(item.hand.active for item in annotated)
+    labelled = [item for item in annotated if item.labelled_hand]
     return {
-        "clips": len(found),
-        "annotated": sum(item.sentences is not None for item in found),
-        "left_out": sum(item.sentences is None for item in found),
+        "clips": len(annotated),
+        "annotated": sum(item.sentences is not None for item in annotated),
+        "left_out": sum(item.sentences is None for item in annotated),
         **{hand: hands[hand] for hand in ("left", "right", "both")},
         "sentences": len(sentences),
         "labelled": len(labelled),
         "agreeing": sum(item.labelled_hand == item.evidence.hand_type for item in labelled),
-        "derived_verbs": sum(item.verb.source == "derived" for item in found),
+        "derived_verbs": sum(item.verb.source == "derived" for item in annotated),
     }

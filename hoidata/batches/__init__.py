@@ -1,1 +1,1 @@
-"""Clips as training sees them: samples, batches and the torch dataset."""
+"""Clips as training samples and padded batches, and requests for motions."""

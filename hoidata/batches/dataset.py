@@ -1,10 +1,9 @@
 """Annotated clips as training samples: a torch Dataset with split, crop, padding and collate.
 
-A sample lives in the *model frame*: the clip's world turned so that things fall along -z (where the gravity direction
-is known) and moved so that the object's origin lies at zero in the first frame. The stored clips are never changed;
-``world_from_model`` takes every sample back.
+A sample is in the *model frame*: the clip's world, rotated so that gravity is -z (if the direction is known) and
+translated so that the object's origin is at zero in the first frame. ``world_from_model`` is the inverse transform.
 
-The layout of the features stands in ``hoidata.clips.features``. Sides are ordered left, right.
+``hoidata.clips.features`` documents the features. Sides are ordered left, right.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,15 +30,7 @@ Crop = Literal["random", "start"]
 
 @dataclass(frozen=True)
 class ClipSample:
-    """One clip in the model frame; NumPy arrays, axes (side, frame, ...), metres and radians.
-
-    hands (2, F, 99), object (F, 10), joints_m (2, F, 21, 3): features and true joints, with the clip's own hand shape.
-    valid (2, F): frames in which a side was tracked; others have its last tracked pose (``HandTrack.held``).
-    active_hands (2,): the sides that take part in the interaction.
-    contact (2, 1024): points that came within ``contact_threshold_m``, the contact stage's, of a joint of that side.
-    text (4, 512): features of the four sentences. betas (2, 10); template_m (2, 778, 3) personal rest meshes, or None.
-    start: first frame within the clip. world_from_model (4, 4). gravity_known: whether the model's -z is down.
-    """
+    """One clip in the model frame; NumPy arrays, axes (side, frame, ...), metres and radians."""
 
     clip_id: str
     dataset: str
@@ -50,21 +41,21 @@ class ClipSample:
     hand_type: str
     sentences: tuple[str, ...]
     synthetic: bool
-    start: int
-    hands: np.ndarray
-    object: np.ndarray
-    joints_m: np.ndarray
-    valid: np.ndarray
-    active_hands: np.ndarray
-    betas: np.ndarray
-    template_m: np.ndarray | None
-    text: np.ndarray
+    start: int  # first frame within the clip
+    hands: np.ndarray  # (2, F, 99) features
+    object: np.ndarray  # (F, 10) features
+    joints_m: np.ndarray  # (2, F, 21, 3) joints with the hand shape of the clip
+    valid: np.ndarray  # (2, F) bool: tracked frames; the others repeat the last tracked pose
+    active_hands: np.ndarray  # (2,) bool
+    betas: np.ndarray  # (2, 10)
+    template_m: np.ndarray | None  # (2, 778, 3) personal rest meshes
+    text: np.ndarray  # (form, 512) features of the sentences
     points: ObjectPoints
-    contact: np.ndarray
-    contact_threshold_m: float
+    contact: np.ndarray  # (2, 1024) bool: points within ``contact_threshold_m`` of a joint of each side
+    contact_threshold_m: float  # of the contact stage
     distances: DistanceEntries
-    world_from_model: np.ndarray
-    gravity_known: bool = True
+    world_from_model: np.ndarray  # (4, 4)
+    gravity_known: bool = True  # whether -z of the model frame is the direction of gravity
 
     @property
     def length(self) -> int:
@@ -72,27 +63,27 @@ class ClipSample:
 
     @property
     def is_tracked(self) -> bool:
-        """Whether the hands that take part are tracked in every frame, so that their motion can be copied."""
+        """Whether the active hands are tracked in all frames, so that their motion can be copied."""
         return bool(self.valid[self.active_hands].all())
 
     @property
     def key(self) -> tuple[str, int, int]:
-        """What tells it from all other samples of a dataset: its clip and which of its frames."""
+        """Identifies the sample in a dataset: clip, first frame, length."""
         return self.clip_id, self.start, self.length
 
     @property
     def nbytes(self) -> int:
-        """Memory of what it has for each frame, which is nearly all."""
+        """Memory of the arrays with one row per frame, which are nearly all of the sample."""
         frames = self.hands, self.object, self.joints_m, self.valid, self.contact
         return sum(array.nbytes for array in (*frames, *vars(self.distances).values()))
 
     @property
     def contact_map(self) -> np.ndarray:
-        """(1024,) bool contact map of Text2HOI: the points touched by any active hand."""
+        """(1024,) bool: points that an active hand touches; the contact map of Text2HOI."""
         return np.logical_or(self.contact[0], self.contact[1])
 
     def crop(self, start: int, length: int) -> "ClipSample":
-        """``length`` frames from ``start``; contact map and distances are restricted to them. The frame stays."""
+        """Return ``length`` frames from ``start``, recentred, with the contact map and distances of these frames."""
         stop = start + length
         distances = self.distances.interval(start, stop)
         return replace(
@@ -107,34 +98,39 @@ class ClipSample:
         ).recentred()
 
     def recentred(self) -> "ClipSample":
-        """The same frames with the object's origin at zero in the first of them."""
-        shift = self.object[0, OBJECT_POSITION].copy()
+        """Translate the model frame so that the object's origin is at zero in the first frame."""
+        shift_m = self.object[0, OBJECT_POSITION].copy()
         hands, objects = self.hands.copy(), self.object.copy()
-        hands[..., WRIST] -= shift
-        objects[:, OBJECT_POSITION] -= shift
-        move = np.eye(4)
-        move[:3, 3] = shift
+        hands[..., WRIST] -= shift_m
+        objects[:, OBJECT_POSITION] -= shift_m
+        old_from_new = np.eye(4)
+        old_from_new[:3, 3] = shift_m
         return replace(
             self,
             hands=hands,
             object=objects,
-            joints_m=self.joints_m - shift,
-            world_from_model=self.world_from_model @ move,
+            joints_m=self.joints_m - shift_m,
+            world_from_model=self.world_from_model @ old_from_new,
         )
 
 
 class HoiDataset(Dataset):
-    """Clips of one split as :class:`ClipSample`, at most ``max_frames`` long.
+    """The clips of one subset as :class:`ClipSample`, at most ``max_frames`` long. Samples are kept in memory.
 
-    crop: "random" draws a window anew for every epoch (see ``set_epoch``) from (seed, epoch, index), so that the same
-    seed gives the same windows in any order of access; "start" takes the first frames. Samples are kept in memory.
+    Args:
+        annotated: the clips.
+        split: subset of the chosen split.
+        max_frames: length of the window.
+        crop: "random" samples a window from (seed, epoch, index), so that it does not depend on the order of access;
+            "start" takes the first frames.
+        seed: seed of the windows.
     """
 
     def __init__(
         self, annotated: AnnotatedStore, split: str, max_frames: int = MAX_FRAMES, crop: Crop = "random", seed: int = 0
     ) -> None:
         if crop not in ("random", "start"):
-            raise BadInput("HoiDataset crop", '"random" or "start"', repr(crop), "name one of them")
+            raise BadInput("HoiDataset crop", '"random" or "start"', repr(crop), "choose one of them")
         self.annotated, self.split = annotated, split
         self.max_frames, self.crop, self.seed = max_frames, crop, seed
         self.epoch = 0
@@ -149,36 +145,36 @@ class HoiDataset(Dataset):
 
     def __getitem__(self, index: int) -> ClipSample:
         whole = self.whole(self.ids[index])
-        spare = whole.length - self.max_frames
-        if spare <= 0:
+        surplus_frames = whole.length - self.max_frames
+        if surplus_frames <= 0:
             return whole
         if self.crop == "start":
             return whole.crop(0, self.max_frames)
         generator = np.random.default_rng([self.seed, self.epoch, index])
-        return whole.crop(int(generator.integers(0, spare + 1)), self.max_frames)
+        return whole.crop(int(generator.integers(0, surplus_frames + 1)), self.max_frames)
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose which random windows the next accesses get."""
+        """Choose the random windows of the next accesses."""
         self.epoch = epoch
 
     def whole(self, clip_id: str) -> ClipSample:
-        """The uncropped sample of a clip."""
+        """Return the uncropped sample of a clip."""
         if clip_id not in self._samples:
             self._samples[clip_id] = load_sample(self.annotated, clip_id)
         return self._samples[clip_id]
 
 
 def load_sample(annotated: AnnotatedStore, clip_id: str) -> ClipSample:
-    """The whole clip as a sample in the model frame."""
+    """Load a whole clip as a sample in the model frame."""
     clip = annotated.clip(clip_id)
     hand_type = annotated.hand_type(clip_id)
     active_hands = np.array([hand_type in (side, "both") for side in SIDES])
     rotation = upright(clip.gravity)
     origin = clip.object.translation_m[0].astype(np.float64)
     points = _points(annotated, annotated.object_key(clip_id))
-    distances = _acting_entries(annotated.distances(clip_id), active_hands)
+    distances = _active_entries(annotated.distances(clip_id), active_hands)
     tracks = [clip.hands[side] for side in SIDES]
-    joints_m = [annotated.joints(clip_id, side)[clip.hands[side].shown_frames] for side in SIDES]
+    joints_m = [annotated.joints(clip_id, side)[clip.hands[side].last_valid_frames] for side in SIDES]
     joints = np.stack([(positions - origin) @ rotation.T for positions in joints_m])
     return ClipSample(
         clip_id=clip_id,
@@ -191,7 +187,7 @@ def load_sample(annotated: AnnotatedStore, clip_id: str) -> ClipSample:
         sentences=tuple(annotated.sentences(clip_id)),
         synthetic=clip.synthetic,
         start=0,
-        hands=np.stack([hand_features(track.held(), rotation, origin) for track in tracks]),
+        hands=np.stack([hand_features(track.with_last_valid_pose(), rotation, origin) for track in tracks]),
         object=object_features(clip.object, rotation, origin),
         joints_m=joints.astype(np.float32),
         valid=np.stack([track.valid for track in tracks]).astype(bool),
@@ -209,7 +205,7 @@ def load_sample(annotated: AnnotatedStore, clip_id: str) -> ClipSample:
 
 
 def contact_of(distances: DistanceEntries, n_points: int, threshold_m: float) -> np.ndarray:
-    """(2, point) bool: points closer than ``threshold_m`` to a joint of each side in any frame of the entries."""
+    """Return (2, point) bool: points closer than ``threshold_m`` to a joint of each side in any frame."""
     contact = np.zeros((2, n_points), dtype=bool)
     near = distances.distance_m < threshold_m
     contact[distances.side[near], distances.point[near]] = True
@@ -234,8 +230,8 @@ def _points(annotated: AnnotatedStore, object_key: str) -> ObjectPoints:
     )
 
 
-def _acting_entries(stored: Any, active_hands: np.ndarray) -> DistanceEntries:
-    """Entries of the acting hands, in the order of their frames, in numbers as small as they are stored."""
+def _active_entries(stored: Any, active_hands: np.ndarray) -> DistanceEntries:
+    """Select the entries of the active hands, sorted by frame, with 16-bit indices to save memory."""
     index = {name: np.asarray(getattr(stored, name), np.int16) for name in ("side", "frame", "joint", "point")}
     entries = DistanceEntries(**index, distance_m=np.asarray(stored.distance_m, np.float32))
     entries = entries.select(active_hands[entries.side])
@@ -244,39 +240,32 @@ def _acting_entries(stored: Any, active_hands: np.ndarray) -> DistanceEntries:
 
 @dataclass(frozen=True, kw_only=True)
 class ClipBatch(RequestBatch):
-    """Recorded clips padded to the longest of them, with all a model may be asked of them (:class:`RequestBatch`).
-
-    Axes (clip, side, frame, ...), padding is zero. hands (B, 2, F, 99), object (B, F, 10), joints_m (B, 2, F, 21, 3).
-    text (B, 4, 512): the four sentences. present (B, 2, F): the side takes part and is tracked in the frame.
-    contact (B, 2, N), at contact_threshold_m, which is that of all clips. chosen (B, K): the frames that losses of
-    geometry see. entries: (entry, 5) int64 rows (clip, side, place among the chosen frames, joint, point) and their
-    distances (entry,).
-    """
+    """Recorded clips padded with zeros to the longest one. Axes (clip, side, frame, ...); ``text`` (B, form, 512)."""
 
     samples: tuple[ClipSample, ...]
-    hands: Tensor
-    object: Tensor
-    joints_m: Tensor
-    present: Tensor
-    contact: Tensor
-    contact_threshold_m: float
-    chosen: Tensor
-    entries: Tensor
-    entry_distance_m: Tensor
+    hands: Tensor  # (B, 2, F, 99)
+    object: Tensor  # (B, F, 10)
+    joints_m: Tensor  # (B, 2, F, 21, 3)
+    present: Tensor  # (B, 2, F) bool: the side is active and tracked
+    contact: Tensor  # (B, 2, N) bool
+    contact_threshold_m: float  # of all clips
+    chosen: Tensor  # (B, K) int64: the frames of geometric losses
+    entries: Tensor  # (entry, 5) int64: clip, side, index in ``chosen``, joint, point
+    entry_distance_m: Tensor  # (entry,)
 
     @property
     def contact_map(self) -> Tensor:
-        """(B, N) contact map as 0 or 1, float32: both active hands together."""
+        """(B, N) float32, 0 or 1: contact map of both hands together."""
         return self.contact.any(1).float()
 
 
 def collate(samples: Sequence[ClipSample], sight: Sight | None = None) -> ClipBatch:
-    """Samples to one padded batch. sight: the frames and distance entries that losses of geometry see; none without."""
+    """Pad samples to one batch. sight: frames and distance entries of geometric losses; by default none."""
     lengths = np.array([sample.length for sample in samples])
-    asked = conditions(samples, [sample.object_model for sample in samples], lengths)
+    shared = conditions(samples, [sample.object_model for sample in samples], lengths)
     n_frames = int(lengths.max())
     sight = sight or Sight.nothing(len(samples))
-    rows, distance = sight.entries([sample.distances for sample in samples])
+    entries, distance = sight.entries([sample.distances for sample in samples])
     arrays = {
         "text": np.stack([sample.text for sample in samples]),
         "hands": _padded([sample.hands for sample in samples], 1, n_frames),
@@ -284,28 +273,28 @@ def collate(samples: Sequence[ClipSample], sight: Sight | None = None) -> ClipBa
         "joints_m": _padded([sample.joints_m for sample in samples], 1, n_frames),
         "contact": np.stack([sample.contact for sample in samples]),
         "chosen": sight.frames,
-        "entries": rows,
+        "entries": entries,
         "entry_distance_m": distance,
     }
     tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
     valid = torch.from_numpy(_padded([sample.valid for sample in samples], 1, n_frames))
-    present = valid & asked["active_hands"][:, :, None] & asked["frames"][:, None]
+    present = valid & shared["active_hands"][:, :, None] & shared["frames"][:, None]
     threshold_m = _batch_threshold_m(samples)
-    return ClipBatch(samples=tuple(samples), present=present, contact_threshold_m=threshold_m, **asked, **tensors)
+    return ClipBatch(samples=tuple(samples), present=present, contact_threshold_m=threshold_m, **shared, **tensors)
 
 
 def _padded(arrays: Sequence[np.ndarray], axis: int, n_frames: int) -> np.ndarray:
-    """The arrays in one, each with zeros up to ``n_frames`` along ``axis``."""
+    """Stack arrays, each padded with zeros to ``n_frames`` along ``axis``."""
     shape = list(arrays[0].shape)
     shape[axis] = n_frames
     padded = np.zeros((len(arrays), *shape), arrays[0].dtype)
-    for row, array in zip(padded, arrays, strict=True):
-        row.swapaxes(0, axis)[: array.shape[axis]] = array.swapaxes(0, axis)
+    for target, array in zip(padded, arrays, strict=True):
+        target.swapaxes(0, axis)[: array.shape[axis]] = array.swapaxes(0, axis)
     return padded
 
 
 def _batch_threshold_m(samples: Sequence[ClipSample]) -> float:
-    found = {sample.contact_threshold_m for sample in samples}
-    if len(found) > 1:
-        raise BadInput("collate", "one contact threshold", f"{sorted(found)} m", "batch one dataset at a time")
-    return found.pop()
+    thresholds_m = {sample.contact_threshold_m for sample in samples}
+    if len(thresholds_m) > 1:
+        raise BadInput("collate", "one contact threshold", f"{sorted(thresholds_m)} m", "batch one dataset at a time")
+    return thresholds_m.pop()

@@ -1,6 +1,7 @@
-"""Which frames and distance entries of its clips a training step sees: chosen first, so that nothing else is read.
+"""Selects the frames and distance entries that geometric losses use in a training step.
 
-A clip of 150 frames has tens of thousands of distance entries; a step uses a few hundred of them.
+A clip of 150 frames has tens of thousands of distance entries and a step uses a few hundred, so only the selected ones
+are read.
 """
 
 from collections.abc import Sequence
@@ -13,10 +14,10 @@ from hoidata.store.distances import DistanceEntries
 
 @dataclass(frozen=True)
 class Sight:
-    """frames: (clip, K) int64, ascending. at_most: how many entries of those frames, drawn by ``random``; None: all."""
+    """Selected frames of each clip, and the number of distance entries to sample from them."""
 
-    frames: np.ndarray
-    at_most: int | None = None
+    frames: np.ndarray  # (clip, K) int64, ascending
+    at_most: int | None = None  # maximum number of entries, sampled with ``random``; None: all entries
     random: np.random.Generator | None = None
 
     @classmethod
@@ -25,39 +26,43 @@ class Sight:
 
     @classmethod
     def everything(cls, lengths: Sequence[int]) -> "Sight":
-        """All frames of the longest clip, and all entries."""
+        """Select all frames of the longest clip, and all entries."""
         return cls(np.tile(np.arange(max(lengths)), (len(lengths), 1)))
 
     @classmethod
     def drawn(cls, lengths: Sequence[int], count: int, at_most: int, random: np.random.Generator) -> "Sight":
-        """``count`` frames of each clip, one drawn from each of as many equal stretches of it."""
-        own = np.asarray(lengths)[:, None]
-        frames = ((np.arange(count) + random.random((len(own), count))) / count * own).astype(np.int64)
-        return cls(np.minimum(frames, own - 1), at_most, random)
+        """Stratified sampling: one frame from each of ``count`` equal intervals of each clip."""
+        column = np.asarray(lengths)[:, None]
+        frames = ((np.arange(count) + random.random((len(column), count))) / count * column).astype(np.int64)
+        return cls(np.minimum(frames, column - 1), at_most, random)
 
     def entries(self, clips: Sequence[DistanceEntries]) -> tuple[np.ndarray, np.ndarray]:
-        """(entry, 5) int64 rows (clip, side, place in ``frames``, joint, point) and their distances (entry,), metres.
+        """Read the entries of the selected frames; with ``at_most``, a uniform sample with replacement.
 
-        Every entry is drawn alike, each time anew. clips: their entries in the order of frames.
+        Args:
+            clips: entries of each clip, sorted by frame.
+
+        Returns:
+            (entry, 5) int64 columns clip, side, index in ``frames``, joint, point; and (entry,) distances in metres.
         """
         if not self.frames.shape[1] or self.at_most == 0:
             return np.zeros((0, 5), np.int64), np.zeros(0, np.float32)
         edges = np.stack((self.frames, self.frames + 1), 1).astype(clips[0].frame.dtype)
-        bounds = [np.searchsorted(own.frame, edge) for own, edge in zip(clips, edges, strict=True)]
+        bounds = [np.searchsorted(entries.frame, edge) for entries, edge in zip(clips, edges, strict=True)]
         first, stop = np.stack(bounds, 1).reshape(2, -1)
         before = np.concatenate(([0], np.cumsum(stop - first)))
         total = int(before[-1])
         ranks = np.arange(total)
         if self.at_most is not None and total > self.at_most:
-            assert self.random is not None  # whoever limits entries says what draws them
+            assert self.random is not None  # a limit needs a generator
             ranks = np.sort(self.random.integers(total, size=self.at_most))
         group = np.searchsorted(before, ranks, side="right") - 1
-        clip, place = np.divmod(group, self.frames.shape[1])
-        row = first[group] + ranks - before[group]
-        parts = np.split(row, np.searchsorted(clip, np.arange(1, len(clips))))
+        clip, frame_index = np.divmod(group, self.frames.shape[1])
+        entry_index = first[group] + ranks - before[group]
+        parts = np.split(entry_index, np.searchsorted(clip, np.arange(1, len(clips))))
         read = {
-            name: np.concatenate([getattr(own, name)[part] for own, part in zip(clips, parts, strict=True)])
+            name: np.concatenate([getattr(entries, name)[part] for entries, part in zip(clips, parts, strict=True)])
             for name in ("side", "joint", "point", "distance_m")
         }
-        columns = (clip, read["side"], place, read["joint"], read["point"])
+        columns = (clip, read["side"], frame_index, read["joint"], read["point"])
         return np.stack(columns, axis=1).astype(np.int64, copy=False), read["distance_m"]

@@ -1,4 +1,4 @@
-"""What a clip is, and how clips are stored."""
+"""Clips: motion of hands and objects, hand conventions, and the feature layout."""
 
 from hoidata.clips.clip import (
     FPS,

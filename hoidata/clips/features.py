@@ -1,11 +1,11 @@
-"""The feature layout of motions: which number of a hand or an object means what, and the features of recorded tracks.
+"""The feature layout of hand and object motion, and the features of recorded tracks.
 
 Text2HOI's layout (Cha et al. 2024, Sec. 3.2.1). Last axis; metres, radians, 6D rotations as in ``rotmat_to_rot6d``:
 
     hand (99):   WRIST 0:3 | GLOBAL_ORIENT_6D 3:9 | HAND_POSE_6D 9:99, the 15 finger joints, absolute
     object (10): OBJECT_POSITION 0:3 | OBJECT_ROTATION_6D 3:9 | OBJECT_HINGE 9, 0 for rigid objects
 
-``HAND_ROTATIONS_6D`` is both kinds of rotation of a hand together, 16 times 6 numbers, the global one first.
+``HAND_ROTATIONS_6D`` has all 16 rotations of a hand, 6 numbers each, the global one first.
 """
 
 import numpy as np
@@ -29,10 +29,12 @@ OBJECT_FEATURES = OBJECT_HINGE + 1
 
 
 def hand_features(track: HandTrack, model_from_world: np.ndarray, origin_m: np.ndarray) -> np.ndarray:
-    """Features (frame, 99) float32 of one hand in the model frame.
+    """Return the features (frame, 99) float32 of one hand in the model frame.
 
-    model_from_world: (3, 3) rotation about ``origin_m``, which becomes zero.
-    origin_m: (3,) metres, world frame.
+    Args:
+        track: the hand.
+        model_from_world: (3, 3) rotation.
+        origin_m: (3,) origin of the model frame, metres, world frame.
     """
     rotmats = track_rotmats(track).astype(np.float64)
     rotmats[:, 0] = model_from_world @ rotmats[:, 0]
@@ -41,7 +43,7 @@ def hand_features(track: HandTrack, model_from_world: np.ndarray, origin_m: np.n
 
 
 def object_features(track: ObjectTrack, model_from_world: np.ndarray, origin_m: np.ndarray) -> np.ndarray:
-    """Features (frame, 10) float32 of one object in the model frame; arguments as in ``hand_features``."""
+    """Return the features (frame, 10) float32 of one object in the model frame; arguments as in ``hand_features``."""
     rotation = model_from_world @ rotvec_to_rotmat(track.rotvec.astype(np.float64))
     position = (track.translation_m - origin_m) @ model_from_world.T
     hinge = np.zeros(len(position)) if track.hinge_rad is None else track.hinge_rad
@@ -49,7 +51,7 @@ def object_features(track: ObjectTrack, model_from_world: np.ndarray, origin_m: 
 
 
 def upright(gravity: np.ndarray | None) -> np.ndarray:
-    """(3, 3) smallest rotation that turns the gravity direction (3,) to -z; the identity where it is unknown."""
+    """Return the smallest rotation (3, 3) from the gravity direction (3,) to -z; the identity if it is unknown."""
     if gravity is None:
         return np.eye(3)
     down = np.asarray(gravity, dtype=np.float64) / np.linalg.norm(gravity)

@@ -1,10 +1,10 @@
-"""Hand parameters of any source to the one convention of ``HandTrack``.
+"""Converts the hand parameters of a source to the convention of ``HandTrack``.
 
-MANO's ``transl`` places the hand so that its wrist joint lies at ``J0 + transl``, where J0 is the wrist of the shaped
-rest mesh (about 10 cm from the model's origin); the hand turns about J0. Other sources give the wrist itself. Once a
-hand is known by its wrist position, a change of frame is the plain ``R' = A R``, ``wrist' = A wrist + b``.
-The mean pose is added to the numbers of the source as they are. Then rotations beyond pi are stored as the equal
-rotations of at most pi (``canonical_rotvec``): numbers of equal poses are near each other, except across pi itself.
+MANO's ``transl`` puts the wrist joint at ``J0 + transl``, where J0 is the wrist of the shaped rest mesh, about 10 cm
+from the model's origin; the hand rotates about J0. Other sources give the wrist position. With the wrist position, a
+change of frame is ``R' = A R``, ``wrist' = A wrist + b``.
+The mean pose is added to the axis-angles of the source. Then each rotation gets an angle of at most pi
+(``canonical_rotvec``), so that similar poses have similar numbers, except at pi.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -21,23 +21,16 @@ from hoidata.hands.model import N_POSE
 
 @dataclass(frozen=True)
 class HandConvention:
-    """What the hand parameters of a dataset mean.
+    """The convention of a dataset's hand parameters."""
 
-    translation: "transl" (the wrist lies at J0 + t) or "wrist" (it lies at t).
-    fingers: "absolute" (zero is the flat hand) or "mean-relative" (the model's mean pose is to be added).
-    components: so many principal components instead of 45 axis-angle numbers; 0 for axis-angles.
-    shape: betas per frame or per sequence, a personal rest mesh without betas, or a shape fitted to keypoints.
-    left_shape: whether the source fitted its left hands with the x of MANO_LEFT's shape directions as released (wrong
-    sign) or corrected; "unused" where there are no betas of the source's own.
-    note: one sentence for people.
-    """
-
-    translation: Literal["transl", "wrist"]
-    fingers: Literal["absolute", "mean-relative"]
+    translation: Literal["transl", "wrist"]  # the wrist is at J0 + t, or at t
+    fingers: Literal["absolute", "mean-relative"]  # zero is the flat hand, or the model's mean pose
     shape: Literal["betas per frame", "betas per sequence", "personal mesh", "fitted"]
+    # Whether the source used MANO_LEFT's shape directions with the wrong sign of x, as released, or corrected; "unused"
+    # if the source has no betas.
     left_shape: Literal["as released", "corrected", "unused"]
-    components: int = 0
-    note: str = ""
+    components: int = 0  # number of principal components of the finger pose; 0 for axis-angles
+    note: str = ""  # one sentence for people
 
     def __post_init__(self) -> None:
         if not 0 <= self.components <= N_POSE:
@@ -45,7 +38,7 @@ class HandConvention:
 
     @property
     def finger_columns(self) -> int:
-        """Numbers per frame that describe the fingers."""
+        """Number of finger parameters per frame."""
         return self.components or N_POSE
 
     def as_json(self) -> dict[str, Any]:
@@ -54,39 +47,32 @@ class HandConvention:
 
 @dataclass(frozen=True)
 class SourceHand:
-    """Parameters of one hand as a source gives them; metres and radians.
+    """Parameters of one hand in the convention of the source; metres and radians."""
 
-    translation_m: (frame, 3); global_orient: (frame, 3) axis-angle; fingers: (frame, 45) axis-angle or
-    (frame, components); betas: (1 or frame, 10); valid: (frame,) bool, None for all; template_m: (778, 3) or None.
-    """
-
-    translation_m: np.ndarray
-    global_orient: np.ndarray
-    fingers: np.ndarray
-    betas: np.ndarray
-    valid: np.ndarray | None = None
-    template_m: np.ndarray | None = None
+    translation_m: np.ndarray  # (frame, 3)
+    global_orient: np.ndarray  # (frame, 3) axis-angle
+    fingers: np.ndarray  # (frame, 45) axis-angles, or (frame, components)
+    betas: np.ndarray  # (1 or frame, 10)
+    valid: np.ndarray | None = None  # (frame,) bool; None: all
+    template_m: np.ndarray | None = None  # (778, 3)
 
 
 @dataclass(frozen=True)
 class FrameChange:
-    """``x_new = rotation @ x_old + translation_m`` per frame; the default changes nothing.
+    """``x_new = rotation @ x_old + translation_m`` per frame; by default the identity."""
 
-    rotation: (1 or frame, 3, 3); translation_m: (1 or frame, 3).
-    """
-
-    rotation: np.ndarray | None = None
-    translation_m: np.ndarray | None = None
+    rotation: np.ndarray | None = None  # (1 or frame, 3, 3)
+    translation_m: np.ndarray | None = None  # (1 or frame, 3)
 
     def points(self, points_m: np.ndarray) -> np.ndarray:
-        """One point per frame (frame, 3)."""
+        """Transform one point per frame (frame, 3)."""
         if self.rotation is None:
             return points_m
         moved = (self.rotation @ points_m[..., None])[..., 0]
         return moved if self.translation_m is None else moved + self.translation_m
 
     def rotvecs(self, rotvec: np.ndarray) -> np.ndarray:
-        """One axis-angle per frame (frame, 3): ``rotation @ R``."""
+        """Transform one axis-angle per frame (frame, 3): ``rotation @ R``."""
         if self.rotation is None:
             return rotvec
         return rotmat_to_rotvec(self.rotation @ rotvec_to_rotmat(np.asarray(rotvec, dtype=np.float64)))
@@ -98,7 +84,7 @@ SAME_FRAME = FrameChange()
 def to_track(
     source: SourceHand, convention: HandConvention, model: HandModel, change: FrameChange = SAME_FRAME
 ) -> HandTrack:
-    """Absolute parameters in the world frame, float32. change: world from the source's frame."""
+    """Convert to absolute parameters in the world frame, float32. change: world from the source's frame."""
     valid = np.ones(len(source.translation_m), dtype=bool) if source.valid is None else np.asarray(source.valid, bool)
     source = _only_valid(source, valid)
     wrist = np.asarray(source.translation_m, dtype=np.float64)
@@ -115,9 +101,9 @@ def to_track(
 
 
 def absolute_fingers(fingers: np.ndarray, convention: HandConvention, model: HandModel) -> np.ndarray:
-    """(frame, 45) absolute axis-angles from axis-angles or principal components.
+    """Return (frame, 45) absolute axis-angles from axis-angles or principal components.
 
-    Raises BadInput when there are not as many columns as the convention says.
+    Raises BadInput if the number of columns differs from the convention.
     """
     angles = np.asarray(fingers, dtype=np.float64)
     if angles.ndim != 2 or angles.shape[1] != convention.finger_columns:
@@ -128,22 +114,22 @@ def absolute_fingers(fingers: np.ndarray, convention: HandConvention, model: Han
 
 
 def hands_for(convention: HandConvention, hands: HandPair) -> HandPair:
-    """The hand models a dataset's parameters belong to: with the left shape directions corrected where it says so."""
+    """Return the hand models of a dataset, with corrected left shape directions if its convention needs them."""
     return with_corrected_left(hands) if convention.left_shape == "corrected" else hands
 
 
 def with_corrected_left(hands: HandPair) -> HandPair:
-    """The pair with the x of the left shape directions negated where it has the right hand's sign.
+    """Negate x of the left shape directions if it has the sign of the right hand (smplx issue 48).
 
-    In the released MANO_LEFT.pkl it equals the right hand's although the template is mirrored; a file that was mended
-    already, and the embedded hand, stay as they are (smplx issue 48; the test of HOT3D's toolkit).
+    In the released MANO_LEFT.pkl x equals that of the right hand although the template is mirrored. A corrected file
+    and the embedded hand are unchanged. The test is that of HOT3D's toolkit.
     """
     left, right = hands.left.shape_directions, hands.right.shape_directions
     if np.abs(left[:, 0] - right[:, 0]).sum() >= 1:
         return hands
-    mended = left.copy()
-    mended[:, 0] *= -1
-    return replace(hands, left=replace(hands.left, shape_directions=mended))
+    corrected = left.copy()
+    corrected[:, 0] *= -1
+    return replace(hands, left=replace(hands.left, shape_directions=corrected))
 
 
 def hand_track(
@@ -154,10 +140,7 @@ def hand_track(
     valid: np.ndarray | None = None,
     template_m: np.ndarray | None = None,
 ) -> HandTrack:
-    """A HandTrack in float32: zeros where the hand is not valid, one row of betas where they do not vary.
-
-    Rotations beyond pi become the equal ones of at most pi.
-    """
+    """Build a HandTrack in float32: zeros in invalid frames, one row of constant betas, angles of at most pi."""
     valid = np.ones(len(wrist_m), dtype=bool) if valid is None else np.asarray(valid, dtype=bool)
     hand_pose = canonical_rotvec(hand_pose.reshape(len(wrist_m), N_POSE // 3, 3)).reshape(len(wrist_m), N_POSE)
     return HandTrack(
@@ -171,7 +154,7 @@ def hand_track(
 
 
 def _only_valid(source: SourceHand, valid: np.ndarray) -> SourceHand:
-    """Zeros where a frame means nothing, so that whatever a file holds there cannot matter."""
+    """Set invalid frames to zero, so that the result does not depend on their contents."""
     if valid.all():
         return source
     names = ("translation_m", "global_orient", "fingers", *(("betas",) if len(source.betas) > 1 else ()))

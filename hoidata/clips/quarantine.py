@@ -1,4 +1,4 @@
-"""A source sequence (or a interval of one) that did not become clips, and why."""
+"""A source sequence, or an interval of one, that was rejected, and the reason."""
 
 from dataclasses import dataclass
 
@@ -7,9 +7,9 @@ from hoidata.errors import BadInput
 
 @dataclass(frozen=True)
 class Quarantined:
-    """What was left out. source_key: e.g. ``grab/s1/mug_drink_1``; the other four fields are those of ``BadInput``."""
+    """A rejected sequence or interval. All fields but the key are those of ``BadInput``."""
 
-    source_key: str
+    source_key: str  # ``grab/s1/mug_drink_1``
     where: str
     expected: str
     got: str
@@ -17,4 +17,4 @@ class Quarantined:
 
     @classmethod
     def from_error(cls, source_key: str, error: BadInput) -> "Quarantined":
-        return cls(source_key, error.where, error.expected, error.got, error.remedy)
+        return cls(source_key, where=error.where, expected=error.expected, got=error.got, remedy=error.remedy)

@@ -1,4 +1,4 @@
-"""A whole recording with the hands as its source has them: their own joints, at the source's own rate."""
+"""A whole recording with the hand skeleton and the frame rate of its source."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -13,35 +13,29 @@ from hoidata.hands.tracked_hand import HandState, TrackedHand
 
 @dataclass(frozen=True, eq=False)
 class OwnHandTrack(Track):
-    """Motion of one hand of any skeleton, world frame.
-
-    wrist_m: (frame, 3) metres. rotvec: (frame, joint, 3) axis-angles, radians: world_from_wrist, then each joint
-    relative to its parent.
-    """
+    """Motion of one hand with the skeleton of the source, world frame."""
 
     PER_FRAME: ClassVar = ("wrist_m", "rotvec")
 
-    wrist_m: np.ndarray
-    rotvec: np.ndarray
+    wrist_m: np.ndarray  # (frame, 3) metres
+    rotvec: (
+        np.ndarray
+    )  # (frame, joint, 3) axis-angles, radians: world_from_wrist, then joints relative to their parents
 
 
 @dataclass(frozen=True, eq=False)
 class HandRecording:
-    """One sequence of a source, every frame of it, in the world its clips are in.
-
-    fps: frames per second. hand: the right hand; the left one is its mirror image. usable: (frame,) bool, False where
-    tracking failed. gravity: (3,) unit vector.
-    """
+    """All frames of one source sequence, in the world frame of its clips."""
 
     dataset: str
     subject: str
     sequence: str
     fps: float
-    hand: TrackedHand
+    hand: TrackedHand  # the right hand; the left hand is its mirror image
     hands: dict[Side, OwnHandTrack]
     object: ObjectTrack
-    usable: np.ndarray
-    gravity: np.ndarray
+    usable: np.ndarray  # (frame,) bool: False if tracking failed
+    gravity: np.ndarray  # (3,) unit vector
     sources: tuple[SourceFile, ...] = ()
 
     @property
@@ -50,27 +44,27 @@ class HandRecording:
 
     @property
     def time_s(self) -> np.ndarray:
-        """(frame,) from 0."""
+        """(frame,) seconds since the first frame."""
         return np.arange(self.n_frames) / self.fps
 
     def tracked_hand(self, side: Side) -> TrackedHand:
         return self.hand if side == "right" else self.hand.mirrored()
 
     def world_from_wrist(self, side: Side) -> RigidTransform:
-        """(frame,) transforms in float64."""
+        """Return (frame,) transforms in float64."""
         track = self.hands[side]
         return RigidTransform.from_rotvec(track.rotvec[:, 0].astype(np.float64), track.wrist_m.astype(np.float64))
 
     def finger_rotmats(self, side: Side, frames: Frames = slice(None)) -> np.ndarray:
-        """(frame, joint - 1, 3, 3) float64, for ``TrackedHand.state``."""
+        """Return (frame, joint - 1, 3, 3) float64 rotations of the finger joints, for ``TrackedHand.state``."""
         return rotvec_to_rotmat(self.hands[side].rotvec[frames, 1:].astype(np.float64))
 
     def state(self, side: Side, frames: Frames = slice(None)) -> HandState:
-        """The recorded hand in its wrist's frame."""
+        """Return the recorded hand in the frame of its wrist."""
         return self.tracked_hand(side).state(self.finger_rotmats(side, frames))
 
     def take(self, frames: Frames) -> "HandRecording":
-        """Some frames of it: evenly spaced ones, of which ``fps`` is the caller's to say."""
+        """Select evenly spaced frames. The caller must adapt ``fps``."""
         return replace(
             self,
             hands={side: track.take(frames) for side, track in self.hands.items()},

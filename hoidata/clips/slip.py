@@ -1,4 +1,4 @@
-"""How fast joints that touch an object slide over it while it moves: a hold that holds lets none slide."""
+"""Slip of hands: speed of touching joints relative to the surface of a moving object. A stable grasp has none."""
 
 import numpy as np
 
@@ -11,31 +11,38 @@ MOVING_CM_S = 2.0
 def touched_parts(
     n_frames: int, frame: np.ndarray, joint: np.ndarray, distance_m: np.ndarray, part: np.ndarray
 ) -> np.ndarray:
-    """(n_frames, 21) the part of the sampled point nearest to each joint of a hand, -1 where none is near.
+    """Return (n_frames, 21): the object part that each joint of a hand touches, -1 for none.
 
-    frame, joint, distance_m, part: (entry,) of every joint near a sampled point; part is the point's.
+    Args:
+        n_frames: number of frames.
+        frame, joint, distance_m: (entry,) joints close to a sampled point.
+        part: (entry,) object part of that point.
     """
     touched = np.full((n_frames, N_JOINTS), -1)
-    if part.any():  # of several entries of a joint the last one stays: the nearest
+    if part.any():  # assignment keeps the last entry of a joint: sort, so that it is the closest point
         order = np.argsort(-distance_m, kind="stable")
         frame, joint, part = frame[order], joint[order], part[order]
     touched[frame, joint] = part
     return touched
 
 
-def joint_slips_cm_s(thing: ObjectTrack, joints_m: np.ndarray, touched: np.ndarray) -> np.ndarray:
-    """(joint and frame,) speed of a touching joint over the part it touches, while that moves there, cm/s.
+def joint_slips_cm_s(track: ObjectTrack, joints_m: np.ndarray, touched: np.ndarray) -> np.ndarray:
+    """Return (sample,) speeds of touching joints relative to the object part that they touch, cm/s.
 
-    A joint counts from a frame to the next where it touches the same part in both, and that part's own motion carries
-    the point under the joint by more than ``MOVING_CM_S``. joints_m: (frame, 21, 3) of one hand, world. touched: as
-    ``touched_parts`` gives it.
+    A sample is a joint and two successive frames in which it touches the same part, while the part moves by more than
+    ``MOVING_CM_S`` at the joint.
+
+    Args:
+        track: motion of the object.
+        joints_m: (frame, 21, 3) joints of one hand, world.
+        touched: result of ``touched_parts``.
     """
-    each = [np.zeros(0)]
-    for part in thing.model.parts:
-        world_from_part = thing.world_from_object @ thing.model.object_from_part(part, thing.hinge_rad)
+    slips = [np.zeros(0)]
+    for part in track.model.parts:
+        world_from_part = track.world_from_object @ track.model.object_from_part(part, track.hinge_rad)
         local = world_from_part.inverse() @ joints_m.astype(np.float64)
         carried = world_from_part[1:] @ local[:-1] - world_from_part[:-1] @ local[:-1]
-        speed, slip = (100 * FPS * np.linalg.norm(way, axis=-1) for way in (carried, np.diff(local, axis=0)))
+        speed, slip = (100 * FPS * np.linalg.norm(step_m, axis=-1) for step_m in (carried, np.diff(local, axis=0)))
         touching = touched == part
-        each.append(slip[touching[1:] & touching[:-1] & (speed > MOVING_CM_S)])
-    return np.concatenate(each)
+        slips.append(slip[touching[1:] & touching[:-1] & (speed > MOVING_CM_S)])
+    return np.concatenate(slips)

@@ -1,1 +1,1 @@
-"""Contact between hands and objects: acting hands, contact maps, sparse distance maps."""
+"""Contact between hands and objects: active hands, contact maps, sparse distance maps."""

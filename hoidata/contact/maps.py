@@ -1,4 +1,4 @@
-"""Which hands take part in a clip, contact maps and distance maps: one per hand, on the object's sampled points."""
+"""Active hands, contact maps and distance maps, one per hand, on the object's sampled points."""
 
 from collections.abc import Mapping
 
@@ -18,11 +18,15 @@ def acting_hands(
     index: ProximityIndex,
     threshold_m: float = CONTACT_THRESHOLD_M,
 ) -> HandEvidence:
-    """Hands of which any joint comes closer than ``threshold_m`` to any sampled point in any valid frame.
+    """Find the active hands: a joint is closer than ``threshold_m`` to a sampled point in any valid frame.
 
     The proximity test of Text2HOI (supplement, section 6).
 
-    joints_m: per side (frame, 21, 3) in the clip's world, metres. index: over ``sample_points(clip.object.model)``.
+    Args:
+        clip: the clip.
+        joints_m: by side, (frame, 21, 3) world joints, metres.
+        index: index of ``sample_points(clip.object.model)``.
+        threshold_m: a hand is active below it.
     """
     distance: dict[Side, np.ndarray] = {}
     for side in SIDES:
@@ -37,9 +41,9 @@ def distance_entries(
     index: ProximityIndex,
     threshold_m: float = CONTACT_THRESHOLD_M,
 ) -> dict[Side, np.ndarray]:
-    """Per hand every (frame, point, joint) closer than ``threshold_m``, with its distance, as rows of ``ENTRY``.
+    """Return, by hand, all (frame, point, joint) closer than ``threshold_m`` as ``ENTRY`` records.
 
-    joints_m: per side (frame, 21, 3) in the clip's world. Raises BadInput for clips longer than int16 can count.
+    Arguments as in ``acting_hands``. Raises BadInput for clips with more frames than int16 can count.
     """
     if clip.n_frames > LONGEST_CLIP:
         raise BadInput(clip.clip_id, f"at most {LONGEST_CLIP} frames", f"{clip.n_frames}", "cut the sequence")
@@ -47,18 +51,18 @@ def distance_entries(
 
 
 def touched_frames(entries: np.ndarray, point_count: int) -> np.ndarray:
-    """(point,) uint16: in how many frames a joint of this hand is as close to the point as entries are."""
+    """Return (point,) uint16: the number of frames in which a joint of one hand touches the point."""
     touched = np.zeros((int(entries["frame"].max(initial=-1)) + 1, point_count), dtype=bool)
     touched[entries["frame"], entries["point"]] = True
     return touched.sum(axis=0, dtype=np.uint16)
 
 
 def contact_maps(entries: Mapping[Side, np.ndarray], point_count: int) -> dict[Side, np.ndarray]:
-    """Per hand Text2HOI's map (point,) uint8. A hand with an entry acts, so the union needs no hand type."""
+    """Return the contact map of Text2HOI by hand, (point,) uint8. Only active hands have entries."""
     return {side: (touched_frames(entries[side], point_count) > 0).astype(np.uint8) for side in SIDES}
 
 
-def f1_score(made: np.ndarray, true: np.ndarray) -> float:
-    """F1 of boolean maps (point,): 2 TP / (2 TP + FP + FN); 1 where both are empty."""
-    total = int(made.sum()) + int(true.sum())
-    return 2 * int((made & true).sum()) / total if total else 1.0
+def f1_score(predicted: np.ndarray, true: np.ndarray) -> float:
+    """Return the F1 of boolean maps (point,): 2 TP / (2 TP + FP + FN); 1 if both are empty."""
+    total = int(predicted.sum()) + int(true.sum())
+    return 2 * int((predicted & true).sum()) / total if total else 1.0

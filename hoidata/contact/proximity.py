@@ -1,7 +1,7 @@
-"""Distances from hand joints to an object's sampled points, found in the object's own frame.
+"""Distances from hand joints to an object's sampled points, computed in the frame of each part.
 
-Moving 21 joints into the frame of a part (which a hinge may have turned) instead of 1,024 points into the world lets
-one index per part serve every frame of every clip, and makes every result independent of the world frame.
+Transforming 21 joints into the frame of a part, instead of 1,024 points into the world, needs one index per part for
+all clips. The results do not depend on the world frame.
 """
 
 from typing import Protocol
@@ -16,7 +16,7 @@ CONTACT_THRESHOLD_M = 0.02
 
 
 class PartPoints(Protocol):
-    """points_m: (point, 3) on an object's surface, in its frame, the hinge at zero. part: (point,) 0 or 1."""
+    """Surface points (point, 3), object frame with the hinge at zero, and the part (point,) of each, 0 or 1."""
 
     @property
     def points_m(self) -> np.ndarray: ...
@@ -25,7 +25,7 @@ class PartPoints(Protocol):
 
 
 class ProximityIndex:
-    """One object's sampled points, ready for both questions. Build once per object, use for all its clips."""
+    """Search index of one object's sampled points, for all of its clips."""
 
     def __init__(self, points: PartPoints) -> None:
         self.count = len(points.points_m)
@@ -33,18 +33,24 @@ class ProximityIndex:
         self._boxes = point_boxes(points.points_m, [np.flatnonzero(points.part == part) for part in self.parts])
 
     def closest_m(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
-        """(frame,) distance from the nearest of the world joints ``(frame, joint, 3)`` to the nearest point, metres."""
+        """Return (frame,) smallest distance between the world joints ``(frame, joint, 3)`` and a point, metres."""
         if not self.parts:
             return np.full(len(joints_m), np.inf)
-        return closest_of_joints(self._places_m(joints_m, track), self._boxes)
+        return closest_of_joints(self._in_parts_m(joints_m, track), self._boxes)
 
     def entries(
         self, joints_m: np.ndarray, valid: np.ndarray, track: ObjectTrack, threshold_m: float = CONTACT_THRESHOLD_M
     ) -> np.ndarray:
-        """All (frame, point, joint, distance) closer than ``threshold_m``, as ``ENTRY`` rows in that order.
+        """Return all (frame, point, joint) closer than ``threshold_m``, in that order, as ``ENTRY`` records.
 
-        joints_m: (frame, joint, 3) world. valid: (frame,) bool; other frames give no entry. Raises BadInput for more
-        frames, points or joints than an entry can count.
+        Args:
+            joints_m: (frame, joint, 3) world.
+            valid: (frame,) bool; other frames give no entry.
+            track: motion of the object.
+            threshold_m: maximum distance.
+
+        Raises:
+            BadInput: more frames, points or joints than an entry can count.
         """
         counted = {"frame": len(joints_m), "point": self.count, "joint": joints_m.shape[1]}
         for name, count in counted.items():
@@ -53,11 +59,11 @@ class ProximityIndex:
                 raise BadInput("distance map", f"at most {most} {name}s", f"{count}", "cut the sequence, or take fewer")
         if not self.parts:
             return np.zeros(0, ENTRY)
-        places_m = self._places_m(joints_m, track)
-        return near_entries(places_m, np.array(valid, bool), self._boxes, self.count, threshold_m)
+        in_parts_m = self._in_parts_m(joints_m, track)
+        return near_entries(in_parts_m, np.array(valid, bool), self._boxes, self.count, threshold_m)
 
-    def _places_m(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
-        """(frame, part, joint, 3) float64, world joints in the frame of each part."""
+    def _in_parts_m(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
+        """Transform world joints to the frame of each part: (frame, part, joint, 3) float64."""
         in_object = track.world_from_object.inverse() @ joints_m.astype(np.float64)
         parts = [track.model.object_from_part(part, track.hinge_rad).inverse() for part in self.parts]
         return np.stack([part_from_object @ in_object for part_from_object in parts], axis=1)

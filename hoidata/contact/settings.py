@@ -1,4 +1,4 @@
-"""Settings of the stage contact, and those an output was made with: whatever comes later reads them there."""
+"""Settings of the stage contact, and the settings of an existing output."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +12,10 @@ from hoidata.settings import build_config
 
 @dataclass(frozen=True)
 class ContactSettings:
-    """points: sampled on every object. threshold_m: a joint closer to a point touches it; larger ones are not kept."""
+    """Settings of the stage contact."""
 
-    points: int = POINT_COUNT
-    threshold_m: float = CONTACT_THRESHOLD_M
+    points: int = POINT_COUNT  # number of points sampled on each object
+    threshold_m: float = CONTACT_THRESHOLD_M  # a closer joint touches the point; larger distances are not stored
 
     def __post_init__(self) -> None:
         if self.points < 1:
@@ -23,14 +23,14 @@ class ContactSettings:
         check_threshold("contact.threshold_m", self.threshold_m)
 
 
-def check_threshold(where: str, threshold_m: float) -> None:
-    """Raise BadInput unless the threshold is a length."""
+def check_threshold(setting: str, threshold_m: float) -> None:
+    """Raise BadInput unless the threshold is positive."""
     if not threshold_m > 0:
-        raise BadInput(where, "metres above 0", repr(threshold_m), f"give a length such as {CONTACT_THRESHOLD_M}")
+        raise BadInput(setting, "metres above 0", repr(threshold_m), f"give a length such as {CONTACT_THRESHOLD_M}")
 
 
 def read_contact_settings(folder: str | Path) -> ContactSettings:
-    """The settings an output of the stage contact was made with. Raises MissingResource where there is none."""
+    """Read the settings of an output of the stage contact. Raises MissingResource without an output."""
     path = Path(folder) / "info.json"
     require_output(folder, "contact")
     info = read_json(path, {"points": int, "threshold_m": NUMBER})

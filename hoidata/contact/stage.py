@@ -1,6 +1,6 @@
-"""Stage contact: sampled points of every object, touched points and joint-point distances of every clip.
+"""Stage contact: sampled points of each object, touched points and joint-point distances of each clip.
 
-The folder it writes is described in ``hoidata.store.annotated``.
+``hoidata.store.annotated`` describes the output folder.
 """
 
 from dataclasses import dataclass, field, replace
@@ -52,11 +52,18 @@ def contact_store(
     jobs: int = 1,
     **changes: Any,
 ) -> dict[str, int]:
-    """Write contact and distance maps of every clip of the store; the folder appears whole or not at all.
+    """Write contact and distance maps of each clip of the store; the folder appears whole or not at all.
 
-    settings, changes: fields of ``changes`` replace those of ``settings``. hands: as in ``open_store``. jobs: workers
-    at most; order and bytes of the result do not depend on it.
-    Returns counts: clips, objects, entries, clips_without_contact.
+    Args:
+        clips_folder: the store.
+        out_folder: folder to write.
+        settings: settings of the stage.
+        hands: as in ``open_store``.
+        jobs: maximum number of worker processes; the result does not depend on it.
+        changes: fields that replace those of ``settings``.
+
+    Returns:
+        Counts: clips, objects, entries, clips_without_contact.
     """
     settings = replace(settings or ContactSettings(), **changes)
     store, points = open_store(clips_folder, hands), settings.points
@@ -77,7 +84,7 @@ def contact_store(
 
 @dataclass
 class _Measurer:
-    """What a worker needs: called with a clip's id, it gives the entries of both hands."""
+    """Computes the entries of both hands of a clip, in a worker process."""
 
     store: Store
     sampled: dict[str, SampledPoints]
@@ -85,7 +92,7 @@ class _Measurer:
     _indices: dict[str, ProximityIndex] = field(default_factory=dict, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Workers build the indices anew, which is quicker than sending them."""
+        """Leave out the indices: building them again is faster than sending them to workers."""
         return {**self.__dict__, "_indices": {}}
 
     def __call__(self, clip_id: str) -> dict[Side, np.ndarray]:
@@ -98,7 +105,7 @@ class _Measurer:
 
 
 def sample_objects(store: Store, points: int) -> dict[str, SampledPoints]:
-    """Sampled points of every object of a store, by name, in the store's order."""
+    """Sample points on each object of a store. Keys are object names in the store's order."""
     return {name: sample_points(store.object_model(name), points) for name in store.objects["object"]}
 
 
@@ -108,12 +115,13 @@ def _write_points(folder: Path, sampled: dict[str, SampledPoints], points: int) 
         rows = [getattr(cloud, name) for cloud in sampled.values()]
         arrays[name] = np.stack(rows).astype(dtype) if rows else np.zeros((0, points, *shape), dtype)
     write_npz(folder / "points.npz", arrays)
-    rows = [{"object": name, "row": row, "method": cloud.method} for row, (name, cloud) in enumerate(sampled.items())]
-    write_table(folder / "objects.parquet", rows, OBJECTS)
+    names = enumerate(sampled.items())
+    objects = [{"object": name, "row": number, "method": cloud.method} for number, (name, cloud) in names]
+    write_table(folder / "objects.parquet", objects, OBJECTS)
 
 
 class _Writer:
-    """Collects clips; writes a shard of distances whenever enough of them are in memory."""
+    """Collects clips, and writes a shard of distances whenever enough entries are in memory."""
 
     def __init__(self, folder: Path, points: int) -> None:
         self.folder, self.points = folder, points
@@ -123,15 +131,15 @@ class _Writer:
         self.pending_rows = self.written_rows = self.shard = self.untouched = 0
 
     def add(self, clip_id: str, entries: dict[Side, np.ndarray]) -> None:
-        row: dict = {"clip_id": clip_id, "row": len(self.rows), "shard": self.shard}
+        clip: dict = {"clip_id": clip_id, "row": len(self.rows), "shard": self.shard}
         for side in SIDES:
             self.touched[side].append(touched_frames(entries[side], self.points))
-            row[f"{side}_start"] = self.pending_rows
+            clip[f"{side}_start"] = self.pending_rows
             self.pending.append(entries[side])
             self.pending_rows += len(entries[side])
-            row[f"{side}_stop"] = self.pending_rows
-        self.rows.append(row)
-        self.untouched += row["left_start"] == row["right_stop"]
+            clip[f"{side}_stop"] = self.pending_rows
+        self.rows.append(clip)
+        self.untouched += clip["left_start"] == clip["right_stop"]
         if self.pending_rows >= ENTRIES_PER_SHARD:
             self._write_shard()
 
@@ -142,7 +150,7 @@ class _Writer:
         self.pending, self.pending_rows, self.shard = [], 0, self.shard + 1
 
     def _column(self, name: str) -> np.ndarray:
-        """Straight from the clips: all rows of a shard take 75 MB once more."""
+        """Concatenate one column at a time: all columns of a shard would need another 75 MB."""
         return np.concatenate([np.zeros(0, ENTRY[name]), *(entries[name] for entries in self.pending)])
 
     def finish(self) -> dict[str, int]:

@@ -80,7 +80,7 @@ def action_followed(pair: Pair, every: int) -> Values:
         return NO_VERB
     if pair.actions is None or pair.verb not in pair.actions.limits:
         return Unmeasured("no limits are known of the verb")
-    followed = pair.actions.followed(pair.verb, _action(pair))
+    followed = pair.actions.satisfies_limits(pair.verb, _action(pair))
     return NO_GRAVITY if followed is None else np.array([float(followed)])
 
 
@@ -91,7 +91,7 @@ def action_named(pair: Pair, every: int) -> Values:
         return NO_VERB
     if pair.actions is None or pair.verb not in pair.actions.centroids:
         return Unmeasured("no training clip has the verb")
-    named = pair.actions.named(_action(pair))
+    named = pair.actions.nearest_verb(_action(pair))
     return NO_GRAVITY if named is None else np.array([float(named == pair.verb)])
 
 

@@ -1,1 +1,1 @@
-"""Is a converted clip sound? Measures of every clip and object mesh, limits on them, and what is left out for it."""
+"""Quality control: measures of each clip and object mesh, limits on them, and the clips that they exclude."""

@@ -1,4 +1,4 @@
-"""All measures of one clip and of one object."""
+"""The quality measures of one clip and of one object."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,31 +19,35 @@ from hoidata.quality.timing import ObjectMotion, time_offset
 from hoidata.surface.contact import deepest_m, placed_hand
 
 NAN = float("nan")
-STILL_M = 0.001
-Joints = Mapping[Side, np.ndarray]
+STILL_M = 0.001  # a smaller step from frame to frame counts as no motion
 TIMING_POINTS = 64
+Joints = Mapping[Side, np.ndarray]
 
 
 @dataclass(frozen=True)
 class ObjectFacts:
-    """What the clips of one object share. points_m: (64, 3) spread over its surface; part: (64,) of each.
-
-    corners_m, corner_part: the 8 corners of each part's bounding box. surfaces: of each part.
-    """
+    """Facts of an object that all of its clips need."""
 
     model: ObjectModel
-    surfaces: dict[int, SurfaceFacts]
-    points_m: np.ndarray
-    part: np.ndarray
-    corners_m: np.ndarray
-    corner_part: np.ndarray
+    surfaces: dict[int, SurfaceFacts]  # by part
+    points_m: np.ndarray  # (64, 3) surface samples, object frame
+    part: np.ndarray  # (64,) part of each sample
+    corners_m: np.ndarray  # (8 * parts, 3) corners of the bounding box of each part
+    corner_part: np.ndarray  # (8 * parts,)
 
     @classmethod
     def of(cls, model: ObjectModel) -> "ObjectFacts":
         surfaces, points = part_facts(model), sample_points(model, TIMING_POINTS)
         boxes = [_box_corners(model.vertices_m[np.unique(model.faces_of(part))]) for part in surfaces]
         corner_part = np.repeat(np.array(list(surfaces), dtype=np.uint8), 8)
-        return cls(model, surfaces, points.points_m, points.part, np.concatenate(boxes), corner_part)
+        return cls(
+            model=model,
+            surfaces=surfaces,
+            points_m=points.points_m,
+            part=points.part,
+            corners_m=np.concatenate(boxes),
+            corner_part=corner_part,
+        )
 
     @property
     def solid_parts(self) -> list[int]:
@@ -51,7 +55,7 @@ class ObjectFacts:
 
 
 def object_row(facts: ObjectFacts) -> dict[str, Any]:
-    """The measures of an object's mesh, the worst of its parts, and what it is."""
+    """Measure an object's mesh; of several parts, the worst value counts."""
     surfaces = facts.surfaces.values()
     return {
         "parts": len(facts.surfaces),
@@ -69,9 +73,9 @@ def object_row(facts: ObjectFacts) -> dict[str, Any]:
 
 
 def clip_row(clip: Clip, facts: ObjectFacts, hands: HandPair, thresholds: Thresholds) -> dict[str, Any]:
-    """Every measure of a clip but ``beta_distance``, which needs the subject's other clips; NaN where there is none."""
-    seen: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
-    joints: Joints = {side: track_joints(clip.hands[side], hands[side]) for side in seen}
+    """Measure a clip, except ``beta_distance``, which needs the subject's other clips. NaN: not measurable."""
+    tracked: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
+    joints: Joints = {side: track_joints(clip.hands[side], hands[side]) for side in tracked}
     corners = clip.object.points_in_world(facts.corners_m, facts.corner_part)
     valid = {side: track.valid for side, track in clip.hands.items()}
     return {
@@ -80,7 +84,7 @@ def clip_row(clip: Clip, facts: ObjectFacts, hands: HandPair, thresholds: Thresh
         **_frozen(clip, joints, corners),
         **_penetration(clip, facts, hands, thresholds),
         **_offset(clip, joints, facts, thresholds),
-        "largest_beta": max((largest_beta(meant_betas(clip.hands[side])) for side in seen), default=NAN),
+        "largest_beta": max((largest_beta(meant_betas(clip.hands[side])) for side in tracked), default=NAN),
         "seam_triangles": facts.model.seam_triangles,
         "gap_share": max(motion.gap_share(flags) for flags in valid.values()),
         "handless_share": float((~(valid["left"] | valid["right"])).mean()),
@@ -89,7 +93,7 @@ def clip_row(clip: Clip, facts: ObjectFacts, hands: HandPair, thresholds: Thresh
 
 
 def object_motion(track: ObjectTrack, facts: ObjectFacts) -> ObjectMotion:
-    """World poses of the object's parts, and its points."""
+    """Return world poses of the object's parts, and its surface points."""
     poses, motions = track.world_from_object, [track.world_from_object]
     if track.model.is_articulated:
         motions.append(poses @ track.model.object_from_part(1, track.hinge_rad))
@@ -108,18 +112,20 @@ def _shaking(clip: Clip, joints: Joints, corners: np.ndarray, thresholds: Thresh
         valid = clip.hands[side].valid
         wrists.append(motion.accelerations_m_s2(positions[:, :1], valid))
         fingers.append(motion.accelerations_m_s2(positions[:, 1:] - positions[:, :1], valid))
-    thing = motion.accelerations_m_s2(corners, np.ones(len(corners), bool))
-    shaking = np.array([series > thresholds.shaking_m_s2 for series in (*wrists, *fingers, thing)]).any(axis=0)
+    object_acceleration = motion.accelerations_m_s2(corners, np.ones(len(corners), bool))
+    shaking = np.array([series > thresholds.shaking_m_s2 for series in (*wrists, *fingers, object_acceleration)]).any(
+        axis=0
+    )
     return {
         "wrist_acceleration_m_s2": max(map(_median, wrists), default=NAN),
         "finger_acceleration_m_s2": max(map(_median, fingers), default=NAN),
-        "object_acceleration_m_s2": _median(thing),
+        "object_acceleration_m_s2": _median(object_acceleration),
         "shaking_share": float(shaking.mean()),
     }
 
 
 def _median(values: np.ndarray) -> float:
-    """Of the finite values; 0, which no limit is below, without any."""
+    """Median of the finite values; 0, which is within any limit, without any."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else 0.0
 
@@ -127,13 +133,13 @@ def _median(values: np.ndarray) -> float:
 def _jumps(clip: Clip, joints: Joints, corners: np.ndarray, thresholds: Thresholds) -> dict[str, float]:
     rule = thresholds.sudden_m, thresholds.large_m, thresholds.sudden_ratio
     steps = [motion.steps_m(positions, clip.hands[side].valid) for side, positions in joints.items()]
-    hand = max((motion.largest_jump(step, *rule) for step in steps), default=motion.Jump(NAN, -1))
-    thing = motion.largest_jump(motion.steps_m(corners, np.ones(len(corners), bool)), *rule)
+    hand_jump = max((motion.largest_jump(step, *rule) for step in steps), default=motion.Jump(NAN, -1))
+    object_jump = motion.largest_jump(motion.steps_m(corners, np.ones(len(corners), bool)), *rule)
     return {
-        "hand_jump_m": hand.size_m,
-        "hand_jump_frame": hand.frame,
-        "object_jump_m": thing.size_m,
-        "object_jump_frame": thing.frame,
+        "hand_jump_m": hand_jump.size_m,
+        "hand_jump_frame": hand_jump.frame,
+        "object_jump_m": object_jump.size_m,
+        "object_jump_frame": object_jump.frame,
     }
 
 
@@ -142,15 +148,15 @@ def _frozen(clip: Clip, joints: Joints, corners: np.ndarray) -> dict[str, float]
     valid = {side: clip.hands[side].valid for side in joints}
     same = {side: motion.equal_steps(_hand_numbers(clip.hands[side]), valid[side]) for side in joints}
     moves = {side: motion.steps_m(positions, valid[side]) > STILL_M for side, positions in joints.items()}
-    thing_moves = motion.steps_m(corners, always) > STILL_M
-    alone = []
+    object_moves = motion.steps_m(corners, always) > STILL_M
+    alone = []  # frames in which one hand is frozen while something else moves
     for side in joints:
         others_move = [flags for other, flags in moves.items() if other != side]
-        alone.append(same[side] & np.any([thing_moves, *others_move], axis=0))
-    things = [motion.equal_steps(_object_numbers(track), always) for track in (clip.object, *clip.other_objects)]
+        alone.append(same[side] & np.any([object_moves, *others_move], axis=0))
+    objects_same = [motion.equal_steps(_object_numbers(track), always) for track in (clip.object, *clip.other_objects)]
     return {
         "frozen_hand_frames": float(max(map(motion.longest_frozen, alone), default=0)),
-        "frozen_all_frames": float(motion.longest_frozen(np.all([*same.values(), *things], axis=0))),
+        "frozen_all_frames": float(motion.longest_frozen(np.all([*same.values(), *objects_same], axis=0))),
     }
 
 
@@ -167,9 +173,9 @@ def _penetration(clip: Clip, facts: ObjectFacts, hands: HandPair, thresholds: Th
     if not facts.solid_parts:
         note = f"penetration not measured: the mesh of {facts.model.name} is not solid"
         return {"penetration_m": NAN, "penetration_share": NAN, "note": note}
-    looked_at = clip.take(slice(None, None, thresholds.penetration_every))
+    sampled = clip.take(slice(None, None, thresholds.penetration_every))
     index = surface_index(facts.model)
-    depth = np.nan_to_num([deepest_m(placed_hand(looked_at, side, hands), index) for side in SIDES]).max(axis=0)
+    depth = np.nan_to_num([deepest_m(placed_hand(sampled, side, hands), index) for side in SIDES]).max(axis=0)
     solid, parts = len(facts.solid_parts), len(facts.surfaces)
     return {
         "penetration_m": float(depth.max()),
@@ -179,41 +185,45 @@ def _penetration(clip: Clip, facts: ObjectFacts, hands: HandPair, thresholds: Th
 
 
 def _offset(clip: Clip, joints: Joints, facts: ObjectFacts, thresholds: Thresholds) -> dict[str, float]:
-    found = time_offset(
+    offset = time_offset(
         [(positions.astype(np.float64), clip.hands[side].valid) for side, positions in joints.items()],
         object_motion(clip.object, facts),
     )
-    sure = found.confidence >= thresholds.offset_confidence
+    is_reliable = offset.confidence >= thresholds.offset_confidence
     return {
-        "time_offset_frames": found.frames if sure else NAN,
-        "time_offset_confidence": found.confidence,
-        "time_offset_samples": found.samples,
+        "time_offset_frames": offset.frames if is_reliable else NAN,
+        "time_offset_confidence": offset.confidence,
+        "time_offset_samples": offset.samples,
     }
 
 
-# Hand shapes that are unlikely: betas are coefficients of principal components in standard deviations (MANO, 2017).
+# Betas are coefficients of principal components in standard deviations (MANO, 2017), so large ones are unlikely.
 
 
 def meant_betas(track: HandTrack) -> np.ndarray:
-    """(row, 10) betas of the frames in which the hand is valid; what stands in the others means nothing."""
+    """Return (row, 10) betas of the valid frames."""
     return track.betas if len(track.betas) == 1 else track.betas[track.valid]
 
 
 def largest_beta(betas: np.ndarray) -> float:
-    """Largest ``|beta|`` of (row, 10), standard deviations. Zero for a personal template, which replaces the shape."""
+    """Return the largest ``|beta|`` of (row, 10), standard deviations; 0 for a personal template."""
     return float(np.abs(betas).max())
 
 
 def distances_to_others(betas: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """How far each clip's betas lie from the same hand's in the other clips, by clip id.
+    """Return the distance of each clip's betas from those of the same hand in the other clips, by clip id.
 
-    betas: (row, 10) of one side of one subject in each clip. The distance is the largest difference of a component
-    between the clip's median row and the median of all other clips' median rows, standard deviations; NaN with fewer
-    than two others, where nobody can say which of them is wrong.
+    The distance is the largest difference of a component between the median of the clip and the median of the other
+    clips' medians, in standard deviations. NaN with fewer than two other clips: either could be wrong.
+
+    Args:
+        betas: by clip id, (row, 10) betas of one side of one subject.
     """
-    rows = {key: np.median(values, axis=0) for key, values in betas.items()}
-    if len(rows) < 3:
-        return dict.fromkeys(rows, float("nan"))
-    table = np.array(list(rows.values()))
+    medians = {key: np.median(values, axis=0) for key, values in betas.items()}
+    if len(medians) < 3:
+        return dict.fromkeys(medians, float("nan"))
+    table = np.array(list(medians.values()))
     others = [np.median(np.delete(table, number, axis=0), axis=0) for number in range(len(table))]
-    return {key: float(np.abs(row - other).max()) for (key, row), other in zip(rows.items(), others, strict=True)}
+    return {
+        key: float(np.abs(median - other).max()) for (key, median), other in zip(medians.items(), others, strict=True)
+    }

@@ -1,4 +1,4 @@
-"""Faults of object meshes: holes, nothing enclosed, several shells, triangles without area, implausible size."""
+"""Faults of object meshes: holes, no enclosed volume, several shells, degenerate triangles."""
 
 from dataclasses import dataclass
 
@@ -11,48 +11,43 @@ from hoidata.geometry.rows import distinct_rows
 from hoidata.objects.distance import unmatched_edges, volume_m3
 from hoidata.objects.model import ObjectModel
 
-SLIVER = 1e-6
+SLIVER = 1e-6  # twice the area over the longest edge squared
 
 
 @dataclass(frozen=True)
 class SurfaceFacts:
-    """One surface, vertices that coincide taken as one, collapsed triangles left out.
+    """Facts of one surface, with coinciding vertices merged and collapsed triangles removed."""
 
-    open_edge_share: share of directed edges without exactly their opposite; 0 means watertight and evenly oriented.
-    volume_m3: enclosed volume, negative for a surface turned inside out; hull_m3: of the convex hull. shells: pieces
-    that share no vertex. degenerate_share: share of triangles that are collapsed or a million times longer than high.
-    """
-
-    open_edge_share: float
-    volume_m3: float
-    hull_m3: float
-    shells: int
-    degenerate_share: float
+    open_edge_share: float  # fraction of directed edges without exactly one opposite; 0: watertight and oriented
+    volume_m3: float  # enclosed volume, negative if the surface is inside out
+    hull_m3: float  # volume of the convex hull
+    shells: int  # connected components
+    degenerate_share: float  # fraction of triangles that are collapsed or slivers
 
     @property
     def unfilled_share(self) -> float:
-        """1 - volume / convex hull: 1 for a surface that encloses nothing, above 1 for one turned inside out."""
+        """1 - volume / convex hull: 1 for a surface that encloses no volume, above 1 for one that is inside out."""
         return 1.0 - self.volume_m3 / self.hull_m3 if self.hull_m3 > 0 else 1.0
 
 
 def surface_facts(vertices_m: np.ndarray, faces: np.ndarray) -> SurfaceFacts:
-    """Facts of the mesh (vertex, 3), (face, 3), metres."""
+    """Measure the mesh (vertex, 3), (face, 3), metres."""
     vertices = np.asarray(vertices_m, dtype=np.float64)
     first, number = distinct_rows(vertices)
     unique, merged = vertices[first], number[faces]
     a, b, c = merged.T
-    kept = merged[(a != b) & (b != c) & (c != a)]
+    triangles = merged[(a != b) & (b != c) & (c != a)]
     return SurfaceFacts(
-        open_edge_share=_open_edge_share(kept),
-        volume_m3=volume_m3(unique, kept),
-        hull_m3=_hull_volume(unique[np.unique(kept)]),
-        shells=_shells(kept),
+        open_edge_share=_open_edge_share(triangles),
+        volume_m3=volume_m3(unique, triangles),
+        hull_m3=_hull_volume(unique[np.unique(triangles)]),
+        shells=_shells(triangles),
         degenerate_share=float(_is_degenerate(unique[merged]).mean()),
     )
 
 
 def part_facts(model: ObjectModel) -> dict[int, SurfaceFacts]:
-    """Facts of each part, by its number, with the cut at the hinge closed; one, 0, for a rigid object."""
+    """Measure each part, with the cut at the hinge closed. A rigid object has part 0 only."""
     return {part: surface_facts(*model.closed_part(part)) for part in model.parts}
 
 
@@ -65,7 +60,7 @@ def _open_edge_share(faces: np.ndarray) -> float:
 def _hull_volume(vertices_m: np.ndarray) -> float:
     try:
         return float(ConvexHull(vertices_m).volume)
-    except (QhullError, ValueError):  # flat, or fewer than four points: there is nothing to enclose
+    except (QhullError, ValueError):  # flat, or fewer than four points
         return 0.0
 
 
@@ -79,7 +74,7 @@ def _shells(faces: np.ndarray) -> int:
 
 
 def _is_degenerate(corners_m: np.ndarray) -> np.ndarray:
-    """(face,) booleans of triangles (face, 3, 3): twice the area is below 1e-6 of the longest edge squared."""
+    """Return (face,) bool of triangles (face, 3, 3): whether they are slivers."""
     edges = np.roll(corners_m, -1, axis=1) - corners_m
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)

@@ -1,9 +1,8 @@
-"""Do hand and object tell the same time? A held object moves as the hand does; a lag between them shows as an offset.
+"""Time offset between hands and object: a grasped object moves with the hand, so a lag shows in their velocities.
 
-For the joint nearest to the object, its velocity is compared with the one it would have if it were fixed to the object,
-both as vectors, at every lag: the normalised cross-correlation of velocities. Unlike speeds, velocities disagree about
-direction too, which makes the peak sharp. A lag so large that the hand is away from where the object was is not found:
-there is no sample.
+The velocity of the joint closest to the object is compared with the velocity of the object at this joint, at each lag:
+the normalised cross-correlation of velocity vectors. Vectors give a sharper peak than speeds. A lag so large that the
+hand is not close to the object gives no sample.
 """
 
 from collections.abc import Sequence
@@ -21,39 +20,34 @@ FEWEST_SAMPLES = 15
 
 
 class TimeOffset(NamedTuple):
-    """frames: by how many frames the hands come after the object (negative: before); NaN where it cannot be told.
+    """Time offset of a clip."""
 
-    confidence: the correlation at that lag, 1 for joints that move exactly with the object; NaN likewise.
-    samples: how many pairs of a hand and a frame in which the object moves near it this rests on.
-    """
-
-    frames: float
-    confidence: float
-    samples: int
+    frames: float  # lag of the hands behind the object; NaN with too few samples
+    confidence: float  # correlation at that lag; 1: joints move exactly with the object
+    samples: int  # number of pairs of a hand and a frame in which the object moves close to it
 
 
 class ObjectMotion(NamedTuple):
-    """An object for this purpose. points_m: (frame, point, 3) spread over its surface, world, metres; part: (point,).
+    """Surface points and part poses of an object, world frame."""
 
-    rotmats: (part, frame, 3, 3) and positions_m: (part, frame, 3), each part's world pose; the parts share no frame of
-    reference but the world.
+    points_m: np.ndarray  # (frame, point, 3) surface samples, metres
+    part: np.ndarray  # (point,)
+    rotmats: np.ndarray  # (part, frame, 3, 3) world_from_part
+    positions_m: np.ndarray  # (part, frame, 3)
+
+
+def time_offset(hands: Sequence[tuple[np.ndarray, np.ndarray]], motion: ObjectMotion) -> TimeOffset:
+    """Find the lag of -10 to 10 frames at which the hands' velocities agree best with the object's.
+
+    Samples are frames in which a joint is within 5 cm of the object and the object moves there at 5 cm/s or more; 15
+    are needed. Score at lag ``L``: ``sum u(t) . v(t + L) / sqrt(sum |u(t)|^2 sum |v(t + L)|^2)``, where v is the
+    velocity of the joint and u that of the object's part at the joint's position at t; central differences.
+
+    Args:
+        hands: of each hand, joints (frame, 21, 3), metres, and valid frames (frame,) bool.
+        motion: motion of the object.
     """
-
-    points_m: np.ndarray
-    part: np.ndarray
-    rotmats: np.ndarray
-    positions_m: np.ndarray
-
-
-def time_offset(hands: Sequence[tuple[np.ndarray, np.ndarray]], thing: ObjectMotion) -> TimeOffset:
-    """The lag in -10 to 10 frames at which the hands' velocities agree best with the object's.
-
-    hands: of each, joints (frame, 21, 3), metres, and usable (frame,) bool. Samples are frames in which a joint is
-    within 5 cm of one of the object's points and the object moves there at 5 cm/s or more; fewer than 15 of them tell
-    nothing. At lag ``L``: ``sum u(t) . v(t + L) / sqrt(sum |u(t)|^2 sum |v(t + L)|^2)``, v of the joint, u of the point
-    of the object (or of its part) that lies where the joint is at t; central differences.
-    """
-    pairs = [_near_pairs(joints, usable, thing) for joints, usable in hands]
+    pairs = [_near_pairs(joints, usable, motion) for joints, usable in hands]
     samples = sum(len(object_m_s) for object_m_s, _ in pairs)
     if samples < FEWEST_SAMPLES:
         return TimeOffset(float("nan"), float("nan"), samples)
@@ -65,39 +59,41 @@ def time_offset(hands: Sequence[tuple[np.ndarray, np.ndarray]], thing: ObjectMot
     return TimeOffset(float(best - LARGEST_LAG), float(score[best]), samples)
 
 
-def _near_pairs(joints_m: np.ndarray, usable: np.ndarray, thing: ObjectMotion) -> tuple[np.ndarray, np.ndarray]:
-    """Velocities (sample, 3) of the object and (lag, sample, 3) of the joint near it, where a moving object is near."""
+def _near_pairs(joints_m: np.ndarray, usable: np.ndarray, motion: ObjectMotion) -> tuple[np.ndarray, np.ndarray]:
+    """Return velocities (sample, 3) of the object and (lag, sample, 3) of the closest joint."""
     n_frames, margin = len(joints_m), LARGEST_LAG + 1
-    # Every lag sees the same frames, so that none wins by leaving out those that disagree.
-    whole = [frame for frame in range(margin, n_frames - margin) if usable[frame - margin : frame + margin + 1].all()]
-    frame, joint, point = _nearest(joints_m, thing.points_m, whole)
-    object_m_s = _carried_velocity(thing, thing.part[point], frame, joints_m[frame, joint])
+    # Each lag uses the same frames. Otherwise a lag could win by skipping frames that disagree.
+    complete_frames = [
+        frame for frame in range(margin, n_frames - margin) if usable[frame - margin : frame + margin + 1].all()
+    ]
+    frame, joint, point = _nearest(joints_m, motion.points_m, complete_frames)
+    object_m_s = _carried_velocity(motion, motion.part[point], frame, joints_m[frame, joint])
     moving = np.linalg.norm(object_m_s, axis=-1) >= MOVING_M_S
     frame, joint = frame[moving], joint[moving]
-    then = frame[None] + np.arange(-LARGEST_LAG, LARGEST_LAG + 1)[:, None]
-    hand_m_s = (joints_m[then + 1, joint] - joints_m[then - 1, joint]) * (FPS / 2)
+    shifted = frame[None] + np.arange(-LARGEST_LAG, LARGEST_LAG + 1)[:, None]
+    hand_m_s = (joints_m[shifted + 1, joint] - joints_m[shifted - 1, joint]) * (FPS / 2)
     return object_m_s[moving], hand_m_s
 
 
 def _nearest(
     joints_m: np.ndarray, points_m: np.ndarray, frames: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of the frames in which they are within 5 cm: the frame, the joint and the point nearest to each other."""
-    found = []
+    """Return frame, joint and point of the closest pair, for frames in which they are within 5 cm."""
+    pairs = []
     for frame in frames:
         distance, point = map(np.asarray, KDTree(points_m[frame]).query(joints_m[frame], distance_upper_bound=NEAR_M))
         joint = int(distance.argmin())
         if np.isfinite(distance[joint]):
-            found.append((frame, joint, int(point[joint])))
-    columns = np.array(found, dtype=np.int64).reshape(-1, 3).T
+            pairs.append((frame, joint, int(point[joint])))
+    columns = np.array(pairs, dtype=np.int64).reshape(-1, 3).T
     return columns[0], columns[1], columns[2]
 
 
-def _carried_velocity(thing: ObjectMotion, part: np.ndarray, frame: np.ndarray, positions_m: np.ndarray) -> np.ndarray:
-    """(sample, 3) m/s of points fixed to a part that lie at ``positions_m (sample, 3)`` in ``frame (sample,)``."""
-    fixed = np.einsum("sij,si->sj", thing.rotmats[part, frame], positions_m - thing.positions_m[part, frame])
+def _carried_velocity(motion: ObjectMotion, part: np.ndarray, frame: np.ndarray, positions_m: np.ndarray) -> np.ndarray:
+    """Return (sample, 3) m/s of points fixed to a part, at ``positions_m (sample, 3)`` in ``frame (sample,)``."""
+    local_m = np.einsum("sij,si->sj", motion.rotmats[part, frame], positions_m - motion.positions_m[part, frame])
     before, after = (
-        np.einsum("sij,sj->si", thing.rotmats[part, then], fixed) + thing.positions_m[part, then]
-        for then in (frame - 1, frame + 1)
+        np.einsum("sij,sj->si", motion.rotmats[part, neighbour], local_m) + motion.positions_m[part, neighbour]
+        for neighbour in (frame - 1, frame + 1)
     )
     return (after - before) * (FPS / 2)

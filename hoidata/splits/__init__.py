@@ -1,1 +1,1 @@
-"""Which clips train, validate and test: rules, named splits kept as data, leak check, training statistics."""
+"""Train, validation and test splits: rules, named splits stored as JSON, leak check, training statistics."""

@@ -1,7 +1,7 @@
-"""Named splits, kept as data: rules in the folder of the dataset they split, ``splits/<name>.json``.
+"""Named splits, stored as JSON in the dataset's folder: ``splits/<name>.json`` with rule, source and version.
 
-Where a split is from and its version stand there too; for one that several datasets have, in ``definitions/`` here,
-with the rule where that is the same. A split of ``OF_ANY_DATASET`` needs no file in the dataset's folder.
+``definitions/`` next to this module has the values that several datasets share; the dataset's file overrides them.
+A split of ``OF_ANY_DATASET`` needs no file in the dataset's folder.
 """
 
 from collections.abc import Mapping
@@ -20,11 +20,11 @@ from hoidata.splits.rules import KINDS, SplitRule
 
 FOLDER = Path(__file__).with_name("definitions")
 OF_ANY_DATASET = ("composition", "drawn-object", "drawn-per-object")
-OWN = "params.yaml"
-OWN_SOURCE = "a rule of this project's params.yaml"
+CUSTOM_NAME = "params.yaml"
+CUSTOM_SOURCE = "a rule of this project's params.yaml"
 RULE_KEYS = tuple(field.name for field in fields(SplitRule))
-# What a rule keeps apart when it does not say: clips of one sequence stay together unless they are cut in time.
-USUAL_PROMISES: dict[str, tuple[Promise, ...]] = {
+# What a rule keeps apart by default. Only rules in time put clips of one sequence into different parts.
+DEFAULT_PROMISES: dict[str, tuple[Promise, ...]] = {
     "subject": ("subject", "sequence", "file"),
     "object": ("object",),
     "sequence": ("sequence", "file"),
@@ -40,17 +40,14 @@ USUAL_PROMISES: dict[str, tuple[Promise, ...]] = {
 
 @dataclass(frozen=True)
 class Definition:
-    """One dataset's part of a named split. version counts changes of the definition; source says whose split it is.
-
-    if_chosen: the stage writes it only where it is chosen, so that it changes nothing for whoever does not want it.
-    """
+    """A named split of one dataset."""
 
     name: str
-    version: int
-    source: str
+    version: int  # counts changes of the definition
+    source: str  # paper or authors of the split
     rule: SplitRule
-    promises: tuple[Promise, ...]
-    if_chosen: bool = False
+    promises: tuple[Promise, ...]  # what no two parts have in common
+    if_chosen: bool = False  # the stage writes this split only if params.yaml chooses it
 
     def as_json(self) -> dict[str, Any]:
         facts = {"name": self.name, "version": self.version, "source": self.source}
@@ -58,61 +55,65 @@ class Definition:
 
 
 def definitions_for(dataset: str) -> dict[str, Definition]:
-    """The named splits a dataset has, by name: those of its folder and those of any dataset."""
+    """Return the named splits of a dataset: those in its folder and ``OF_ANY_DATASET``, by name."""
     folder = dataset_folder(dataset)
-    own = [] if folder is None else (folder / "splits").glob("*.json")
-    paths = {path.stem: path for path in (*(FOLDER / f"{name}.json" for name in OF_ANY_DATASET), *own)}
+    dataset_paths = [] if folder is None else (folder / "splits").glob("*.json")
+    paths = {path.stem: path for path in (*(FOLDER / f"{name}.json" for name in OF_ANY_DATASET), *dataset_paths)}
     return {name: _read(paths[name]) for name in sorted(paths)}
 
 
-def choose(dataset: str, wanted: str | Mapping[str, Any] | None) -> Definition:
-    """The split of a dataset: what params.yaml chooses, else what its facts do.
+def choose(dataset: str, choice: str | Mapping[str, Any] | None) -> Definition:
+    """Return the split that params.yaml chooses for a dataset, by default the one that the dataset's facts name.
 
-    wanted: a name, a rule of the user's own (a mapping, see ``SplitRule``), or None where params.yaml says nothing.
-    Raises BadInput that lists the known names, or the known keys of a rule.
+    Args:
+        dataset: name of the dataset.
+        choice: name of a split, a custom rule (keys as in ``SplitRule``), or None if params.yaml has no entry.
+
+    Raises:
+        BadInput: the name or a key of the rule is unknown; the message lists the valid ones.
     """
-    where, known = f"params.yaml: split.{dataset}", definitions_for(dataset)
+    setting, definitions = f"params.yaml: split.{dataset}", definitions_for(dataset)
     facts = dataset_facts(dataset)
-    wanted = facts.split or None if facts and wanted is None else wanted
-    if isinstance(wanted, Mapping):
-        return _own(where, dataset, wanted)
-    if wanted not in known:
-        got = "nothing" if wanted is None else repr(wanted)
+    choice = facts.split or None if facts and choice is None else choice
+    if isinstance(choice, Mapping):
+        return _custom(setting, dataset, choice)
+    if choice not in definitions:
+        got = "nothing" if choice is None else repr(choice)
         remedy = "correct it, or write a rule: {by: subject, train: rest, validation: [s9], test: [s10]}"
-        raise BadInput(where, f"one of: {', '.join(known)}", got, remedy)
-    return known[wanted]
+        raise BadInput(setting, f"one of: {', '.join(definitions)}", got, remedy)
+    return definitions[choice]
 
 
-def _own(where: str, dataset: str, values: Mapping[str, Any]) -> Definition:
-    rule, promises = _rule_and_promises(where, values)
+def _custom(setting: str, dataset: str, values: Mapping[str, Any]) -> Definition:
+    rule, promises = _rule_and_promises(setting, values)
     motion_files = published(dataset).motion_files
     if not motion_files and "file" in values.get("promises", ()):
-        remedy = f"take it out: which raw files of {dataset} hold motion is not known here"
-        raise BadInput(f"{where}.promises", "promises that can be checked", "file", remedy)
+        remedy = f"take it out: the files of {dataset} that contain motion are not listed in its published.json"
+        raise BadInput(f"{setting}.promises", "promises that can be checked", "file", remedy)
     checked: list[Promise] = [promise for promise in promises if promise != "file" or motion_files]
-    return Definition(OWN, 0, OWN_SOURCE, rule, tuple(checked))
+    return Definition(name=CUSTOM_NAME, version=0, source=CUSTOM_SOURCE, rule=rule, promises=tuple(checked))
 
 
-def _rule_and_promises(where: str, values: Mapping[str, Any]) -> tuple[SplitRule, tuple[Promise, ...]]:
+def _rule_and_promises(source: str, values: Mapping[str, Any]) -> tuple[SplitRule, tuple[Promise, ...]]:
     unknown = sorted(map(str, values.keys() - {*RULE_KEYS, "promises"}))
     if unknown or "by" not in values:
         got = ", ".join(unknown) or "no `by`"
         raise BadInput(
-            where, f"keys among: {', '.join(RULE_KEYS)}, promises; by: {', '.join(KINDS)}", got, "correct it"
+            source, f"keys among: {', '.join(RULE_KEYS)}, promises; by: {', '.join(KINDS)}", got, "correct it"
         )
     try:
         rule = SplitRule(**{key: value for key, value in values.items() if key != "promises"})
     except TypeError as error:
-        raise BadInput(where, "shares and least_clips as numbers", str(error), "correct it") from error
-    promises = values.get("promises", USUAL_PROMISES[rule.by])
+        raise BadInput(source, "shares and least_clips as numbers", str(error), "correct it") from error
+    promises = values.get("promises", DEFAULT_PROMISES[rule.by])
     if not isinstance(promises, list | tuple) or not set(promises) <= set(PROMISES):
-        raise BadInput(f"{where}.promises", f"a list of: {', '.join(PROMISES)}", repr(promises), "correct it")
+        raise BadInput(f"{source}.promises", f"a list of: {', '.join(PROMISES)}", repr(promises), "correct it")
     return rule, tuple(promises)
 
 
 @lru_cache
 def _read(path: Path) -> Definition:
-    """One dataset's rule of a named split."""
+    """Read one dataset's definition of a named split."""
     general = FOLDER / path.name
     try:
         values = (orjson.loads(general.read_bytes()) if general.is_file() else {}) | orjson.loads(path.read_bytes())
@@ -122,26 +123,26 @@ def _read(path: Path) -> Definition:
     if not all(origin.values()):
         raise BadInput(path, "the split's version and source", f"{origin}", "state them there")
     rule, promises = _rule_and_promises(str(path), values)
-    return Definition(path.stem, origin["version"], origin["source"], rule, promises, bool(if_chosen))
+    return Definition(
+        name=path.stem,
+        version=origin["version"],
+        source=origin["source"],
+        rule=rule,
+        promises=promises,
+        if_chosen=bool(if_chosen),
+    )
 
 
 @dataclass(frozen=True)
 class Published:
-    """What ``published.json`` states; what it leaves out is not known.
+    """Contents of a dataset's ``published.json``: what its authors state. An absent list is unknown."""
 
-    source: where the lists are from, or why there is none. sequences: all names. without_ground_truth: beginnings of
-    withheld ones.
-
-    motion_files: patterns of the raw files that hold motion; other raw files (meshes, templates) serve many sequences.
-    segments, frames: per sequence, where the source tells.
-    """
-
-    source: str
-    sequences: tuple[str, ...] = ()
-    without_ground_truth: tuple[str, ...] = ()
-    motion_files: tuple[str, ...] = ()
-    segments: tuple[int, ...] = ()
-    frames: tuple[int, ...] = ()
+    source: str  # source of the lists, or the reason why there are none
+    sequences: tuple[str, ...] = ()  # all sequence names
+    without_ground_truth: tuple[str, ...] = ()  # prefixes of sequences whose ground truth is withheld
+    motion_files: tuple[str, ...] = ()  # patterns of raw files with motion; others (meshes) serve many sequences
+    segments: tuple[int, ...] = ()  # number of segments of each sequence
+    frames: tuple[int, ...] = ()  # number of frames of each sequence
 
     @property
     def usable(self) -> tuple[str, ...]:
@@ -151,7 +152,7 @@ class Published:
 
 @lru_cache
 def published(dataset: str) -> Published:
-    """What is known of a dataset; nothing (an empty ``source``) of one without a list."""
+    """Read a dataset's ``published.json``; without the file the result has an empty ``source``."""
     folder = dataset_folder(dataset)
     path = None if folder is None else folder / "published.json"
     if path is None or not path.is_file():
@@ -160,8 +161,8 @@ def published(dataset: str) -> Published:
         values = orjson.loads(path.read_bytes())
     except orjson.JSONDecodeError as error:
         raise BadInput(path, "a JSON object", str(error), "correct it") from error
-    found = build_config(Published, values, str(path))
+    lists = build_config(Published, values, str(path))
     if empty := sorted(key for key, value in values.items() if value == []):
-        remedy = "leave it out, and say in its source why there is none"
+        remedy = "remove the key, and give the reason in `source`"
         raise BadInput(f"{path}: {empty[0]}", "a list of one entry or more", "an empty one", remedy)
-    return found
+    return lists

@@ -1,13 +1,13 @@
-"""Stage split: every named split of a dataset, the chosen one, what they promise, and the training statistics.
+"""Stage split: assign each clip of a dataset to a part, in the chosen split and in each named split.
 
-    splits.parquet    clip_id, one column per named split the dataset has (of any dataset's, those for which it has
-                      clips enough; none that is written only where it is chosen), and `split`, the chosen one: train,
-                      validation, test, or null for a clip without sentences or that no part covers; one row per clip
-    info.json         chosen and every split: definition, clips per part, leak check; how complete the dataset is;
-                      missing: which parts of the chosen split have no clips and what that means, where there are any
-    statistics.json   of every stored quantity, over the training part of the chosen split (``training_statistics``)
+    splits.parquet    one row per clip: clip_id, one column per named split that has enough clips, and `split`, the
+                      chosen one. Values: train, validation, test, or null for a clip without sentences and for a clip
+                      that no part covers
+    info.json         definition, clips per part and leak check of each split; completeness of the dataset; `missing`:
+                      the empty parts of the chosen split, if any, and their consequence
+    statistics.json   ``training_statistics`` over the training part of the chosen split
 
-``hoidata.store.annotated`` reads the chosen split from here.
+``hoidata.store.annotated`` reads the chosen split from this folder.
 """
 
 import hashlib
@@ -38,25 +38,35 @@ def split_store(
     clips_folder: str | Path,
     annotation_folder: str | Path,
     out_folder: str | Path,
-    wanted: str | Mapping[str, Any] | None,
+    choice: str | Mapping[str, Any] | None,
 ) -> dict[str, int]:
     """Split the annotated clips of a store; the folder appears whole or not at all.
 
-    wanted: the name of a split, or a rule of the user's own (see ``choose``). Parts are counted over the clips that
-    have sentences, so that none runs empty through clips nobody uses.
-    Returns clips per part of the chosen split. Raises BadInput when it breaks one of its promises.
+    Only clips with sentences are split, because no model uses the others.
+
+    Args:
+        clips_folder: the store.
+        annotation_folder: output of the stage annotate.
+        out_folder: folder to write.
+        choice: name of a split, or a custom rule (see ``choose``).
+
+    Returns:
+        Number of clips of each part of the chosen split.
+
+    Raises:
+        BadInput: two parts of the chosen split share what it promises to keep apart.
     """
     store = open_store(clips_folder)
     hand_types, used = _annotated_clips(store, Path(annotation_folder))
     dataset = str(store.info["dataset"])
-    chosen = choose(dataset, wanted)
+    chosen = choose(dataset, choice)
     named = {name: item for name, item in definitions_for(dataset).items() if not item.if_chosen}
-    words = hand_types.loc[used]
-    rows = store.sequences.loc[used].assign(verb=words["verb"], hand_type=words["hand_type"])
+    labels = hand_types.loc[used]
+    sequences = store.sequences.loc[used].assign(verb=labels["verb"], hand_type=labels["hand_type"])
     digests = {clip_id: motion_digest(store.clip(clip_id, motion_only=True)) for clip_id in used}
-    parts = _assignments(rows, chosen, named.values())
+    parts = _assignments(sequences, chosen, named.values())
     named = {name: item for name, item in named.items() if item in parts}
-    leaks = {definition: _leaks(store, rows, parts[definition], definition, digests) for definition in parts}
+    leaks = {definition: _leaks(store, sequences, parts[definition], definition, digests) for definition in parts}
     _refuse_leaks(chosen, leaks[chosen])
     records = {name: _record(store, parts[item], item, leaks[item]) for name, item in named.items()}
     info = {
@@ -78,12 +88,14 @@ def split_store(
     return info["chosen"]["clips"]
 
 
-def _assignments(rows: pd.DataFrame, chosen: Definition, named: Iterable[Definition]) -> dict[Definition, Assignment]:
-    """The chosen split and every named one that these clips can be split by: a held-out part may be too small."""
+def _assignments(
+    sequences: pd.DataFrame, chosen: Definition, named: Iterable[Definition]
+) -> dict[Definition, Assignment]:
+    """Assign clips by the chosen and the named splits. Named splits with too few clips to hold out are skipped."""
     parts: dict[Definition, Assignment] = {}
     for definition in (*named, chosen):
         try:
-            parts[definition] = assign_split(rows, definition.rule).to_dict()
+            parts[definition] = assign_split(sequences, definition.rule).to_dict()
         except BadInput:
             if definition == chosen:
                 raise
@@ -91,7 +103,7 @@ def _assignments(rows: pd.DataFrame, chosen: Definition, named: Iterable[Definit
 
 
 def motion_digest(clip: Clip) -> str:
-    """SHA-256 of the numbers that move: equal for a copy under another name, whoever and whatever it is said to be."""
+    """Return the SHA-256 of a clip's motion arrays. Copies under other names, subjects or objects have the same."""
     digest = hashlib.sha256()
     for side in SIDES:
         track = clip.hands[side]
@@ -103,28 +115,28 @@ def motion_digest(clip: Clip) -> str:
 
 
 def _annotated_clips(store: Store, annotation: Path) -> tuple[pd.DataFrame, list[str]]:
-    """The annotation's table of hands, and the clips that have sentences, in the store's order."""
+    """Read the annotation's table of hands, and the ids of the clips with sentences in the store's order."""
     hand_types = read_table(annotation / "hand_type.parquet").set_index("clip_id", drop=False)
     if list(hand_types["clip_id"]) != store.ids:
         got = f"{len(hand_types)} clips of another conversion"
         raise BadInput(annotation, f"the {len(store)} clips of {store.folder}", got, "run the stage 'annotate' again")
-    named = set(read_table(annotation / "text.parquet", ["clip_id"])["clip_id"])
-    return hand_types, [clip_id for clip_id in store.ids if clip_id in named]
+    with_sentences = set(read_table(annotation / "text.parquet", ["clip_id"])["clip_id"])
+    return hand_types, [clip_id for clip_id in store.ids if clip_id in with_sentences]
 
 
 def _leaks(
-    store: Store, rows: pd.DataFrame, parts: Assignment, definition: Definition, digests: Mapping[str, str]
+    store: Store, sequences: pd.DataFrame, parts: Assignment, definition: Definition, digests: Mapping[str, str]
 ) -> Leaks:
     patterns = published(str(store.info["dataset"])).motion_files
     paths = store.files["path"].tolist()
-    return find_leaks(rows, parts, definition.promises, files=paths, motion_files=patterns, digests=digests)
+    return find_leaks(sequences, parts, definition.promises, files=paths, motion_files=patterns, digests=digests)
 
 
 def _refuse_leaks(chosen: Definition, leaks: Leaks) -> None:
     if leaks.broken:
         kind = leaks.broken[0]
         got = f"{len(leaks.shared[kind])} in several: {', '.join(leaks.shared[kind][:3])}"
-        # Clips cut next to each other share frames once a margin is kept around them.
+        # A margin around clips that follow each other makes them overlap.
         remedy = "choose another split" + (", or convert with margin_frames: 0" if kind == "frame" else "")
         raise BadInput(f"split {chosen.name}", f"no {kind} in two parts, as it promises", got, remedy)
 
@@ -142,13 +154,13 @@ def _record(store: Store, parts: Assignment, definition: Definition, leaks: Leak
 
 
 def _completeness(store: Store, dataset: str) -> dict[str, Any] | None:
-    """How many of the sequences the makers list gave a clip; None where no list is published."""
-    listed = published(dataset)
-    if not listed.sequences:
+    """Count the published sequences that have a clip; None if no list is published."""
+    lists = published(dataset)
+    if not lists.sequences:
         return None
-    here = set(listed.usable) & set(store.sequences["sequence"])
-    facts = {"sequences": len(listed.sequences), "usable": len(listed.usable), "with_clips": len(here)}
-    return {"source": listed.source, **facts}
+    with_clips = set(lists.usable) & set(store.sequences["sequence"])
+    facts = {"sequences": len(lists.sequences), "usable": len(lists.usable), "with_clips": len(with_clips)}
+    return {"source": lists.source, **facts}
 
 
 def _write_parts(path: Path, clip_ids: list[str], columns: dict[str, Assignment]) -> None:

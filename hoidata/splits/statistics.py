@@ -1,4 +1,4 @@
-"""Statistics of every stored quantity, over the training part only, so that no held-out number reaches a model."""
+"""Statistics of the stored quantities over the training clips only, so that no held-out value reaches a model."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,35 +18,39 @@ WORLD, ROT6D = "xyz, world axes", "R00 R01 R10 R11 R20 R21 of world_from_"
 
 @dataclass(frozen=True)
 class Quantity:
-    """One quantity. of: a clip to rows (row, column), one per frame in which the quantity means something, or one."""
+    """A measured quantity of clips."""
 
     name: str
     unit: str
-    axes: str
-    of: Callable[[Clip], np.ndarray]
+    axes: str  # what the columns are
+    of: Callable[[Clip], np.ndarray]  # clip to (row, column): one row per frame with a value, or one row per clip
 
 
 def training_statistics(store: Store, train: Sequence[str], hand_types: pd.DataFrame) -> dict[str, Any]:
-    """Count, mean, standard deviation, extremes and quantiles of every quantity over the clips ``train``.
+    """Compute count, mean, standard deviation, extremes and quantiles of each quantity over the training clips.
 
-    hand_types: the annotation's table under clip ids, for the closest approach of each hand (absent where no frame of
-    the hand is valid). Frames in which a hand is not valid, and the hinge of rigid objects, count nowhere.
-    One group of quantities is in memory at a time; a quantity nobody has gives a count of 0 and nothing else.
+    Invalid frames of a hand and the hinge of rigid objects are skipped. A quantity without values has a count of 0.
+
+    Args:
+        store: the clips.
+        train: ids of the training clips.
+        hand_types: the annotation's table under clip ids, for the closest approach of each hand.
     """
-    found: dict[str, Any] = {}
-    for group in (*(_hand_quantities(side) for side in SIDES), _object_quantities()):
-        found |= _measure(group, store, train)
+    quantities: dict[str, Any] = {}
+    for group in (*(_hand_quantities(side) for side in SIDES), _object_quantities()):  # one group in memory at a time
+        quantities |= _measure(group, store, train)
     for side in SIDES:
         nearest = hand_types.loc[list(train), f"min_{side}_m"].to_numpy(np.float64)
         facts = {"unit": "metre", "axes": "closest joint to sampled object point of each clip"}
-        found[f"{side}_closest_m"] = facts | summary(nearest[np.isfinite(nearest)][:, None])
-    return {"clips": len(train), "frames": _frames(store, train), "quantiles": list(QUANTILES), "quantities": found}
+        quantities[f"{side}_closest_m"] = facts | summary(nearest[np.isfinite(nearest)][:, None])
+    n_frames = int(store.sequences.loc[list(train), "n_frames"].sum())
+    return {"clips": len(train), "frames": n_frames, "quantiles": list(QUANTILES), "quantities": quantities}
 
 
 def summary(values: np.ndarray) -> dict[str, Any]:
-    """values: (row, column); a list of one figure (or one list of quantiles) per column.
+    """Summarise values (row, column): per statistic, a list with one number per column.
 
-    Population standard deviation; quantiles interpolate linearly between sorted values.
+    Population standard deviation. Quantiles interpolate linearly between sorted values.
     """
     if not len(values):
         return {"count": 0}
@@ -55,9 +59,9 @@ def summary(values: np.ndarray) -> dict[str, Any]:
 
 
 def _column_summary(values: np.ndarray) -> dict[str, Any]:
-    figures = {"mean": values.mean(), "std": values.std(), "min": values.min(), "max": values.max()}
+    statistics = {"mean": values.mean(), "std": values.std(), "min": values.min(), "max": values.max()}
     quantiles = [_rounded(value) for value in np.quantile(values, QUANTILES)]
-    return {**{name: _rounded(figure) for name, figure in figures.items()}, "quantile_values": quantiles}
+    return {**{name: _rounded(value) for name, value in statistics.items()}, "quantile_values": quantiles}
 
 
 def _measure(group: Sequence[Quantity], store: Store, train: Sequence[str]) -> dict[str, Any]:
@@ -66,11 +70,11 @@ def _measure(group: Sequence[Quantity], store: Store, train: Sequence[str]) -> d
         clip = store.clip(clip_id, motion_only=True)
         for quantity in group:
             rows[quantity.name].append(np.asarray(quantity.of(clip), dtype=np.float32))
-    found = {}
+    summaries = {}
     for quantity in group:
         values = np.concatenate(rows.pop(quantity.name)) if train else np.zeros((0, 1), np.float32)
-        found[quantity.name] = {"unit": quantity.unit, "axes": quantity.axes} | summary(values)
-    return found
+        summaries[quantity.name] = {"unit": quantity.unit, "axes": quantity.axes} | summary(values)
+    return summaries
 
 
 def _hand_quantities(side: Side) -> list[Quantity]:
@@ -113,10 +117,6 @@ def _to_object(hand: HandTrack, clip: Clip) -> np.ndarray:
 
 def _rot6d(rotvec: np.ndarray) -> np.ndarray:
     return rotmat_to_rot6d(rotvec_to_rotmat(rotvec.astype(np.float64)))
-
-
-def _frames(store: Store, train: Sequence[str]) -> int:
-    return int(store.sequences.loc[list(train), "n_frames"].sum())
 
 
 def _rounded(value: float) -> float:

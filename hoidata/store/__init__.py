@@ -1,1 +1,1 @@
-"""The Parquet + NPZ store of clips, and the annotated store over it."""
+"""Store of clips in Parquet and NPZ files, and the annotated store built on it."""

@@ -1,27 +1,26 @@
-"""The annotated dataset of one profile and source: clips, words, contacts, read from the four folders stages write.
+"""Reads the annotated dataset of a profile: clips, sentences, contacts and splits from the folders of four stages.
 
     clips/        the store (see ``hoidata.store.store``)
-    annotation/   text.parquet        clip_id, form, sentence, text_row (row of embeddings.npz); per clip the four
-                                      forms
+    annotation/   text.parquet        clip_id, form, sentence, text_row (row of embeddings.npz); per clip one row
+                                      for each sentence form
                   hand_type.parquet   clip_id, hand_type, source (proximity or annotated), min_left_m, min_right_m,
-                                      labelled_hand, agreement (of it with the hand that comes near), reason (why a
-                                      clip is left out), verb, verb_source (source: the clip came with it; derived:
-                                      its motion shows it), verb_evidence (what that rests on)
-                  hand_distance.npz   how near each hand is in every frame (``hoidata.store.hand_evidence``)
+                                      labelled_hand, agreement (whether labelled_hand is the hand close to the
+                                      object), reason (why a clip is excluded), verb, verb_source (source: a label
+                                      of the source; derived: from the motion), verb_evidence (reason for the verb)
+                  hand_distance.npz   distance of each hand in each frame (``hoidata.store.hand_evidence``)
                   embeddings.npz      features (sentence, 512) float32, sentences (sentence,) text, identity JSON bytes
-                  info.json           encoder, threshold_m, points, hand (where it is not proximity), forms,
-                                      counts
+                  info.json           encoder, threshold_m, points, hand (unless it is proximity), forms, counts
     contact/      objects.parquet     object, row, method        points.npz    (object, 1024, ...) sampled points
                   clips.parquet       clip_id, row, shard, and per side <side>_start, <side>_stop: rows of the shard
-                  contact.npz         <side>_frames (clip, 1024) uint16: in how many frames each point is touched
+                  contact.npz         <side>_frames (clip, 1024) uint16: number of frames in which each point is touched
                   distances-*.npz     frame int16, point int16, joint int8, distance_m float32: one row per entry
                   info.json           threshold_m, points, counts
     splits/       splits.parquet      clip_id, split (the chosen one), one column per named split
                   info.json           definitions, clips per subset (train, validation, test), leak checks
                   statistics.json     of every stored quantity over the training subset
 
-A clip without an acting hand, or without words, has a row with the reason in hand_type.parquet and no sentence; it
-belongs to no subset of a split. Clips that match no rule of a split are excluded too.
+A clip without an active hand, or without a verb or noun, has no sentence; ``reason`` in hand_type.parquet says why.
+Splits exclude such clips, and clips that match no rule of the split.
 """
 
 from pathlib import Path
@@ -52,7 +51,12 @@ SUBSET_COUNTS = {"name": str, "clips": dict.fromkeys((*SUBSETS, "left_out"), int
 def load_annotated(root: str | Path, hands: HandPair | None = None) -> "AnnotatedStore":
     """Open ``root/clips``, ``root/annotation``, ``root/contact`` and ``root/splits`` for reading.
 
-    hands: as in ``open_store``. Raises MissingResource naming the stage that has not run, or why a dataset is empty.
+    Args:
+        root: folder of one dataset of a profile.
+        hands: as in ``open_store``.
+
+    Raises:
+        MissingResource: a stage has not run, or the dataset is empty; the message names the stage or the reason.
     """
     root = Path(root)
     for folder, stage in STAGES.items():
@@ -61,7 +65,7 @@ def load_annotated(root: str | Path, hands: HandPair | None = None) -> "Annotate
 
 
 class AnnotatedStore:
-    """Clips with their words and contacts, by clip id. ``ids()`` are the clips that have sentences."""
+    """Clips with their sentences and contacts, by clip id. ``ids()`` are the clips with sentences."""
 
     def __init__(self, root: Path, store: Store) -> None:
         self.root = root
@@ -93,9 +97,9 @@ class AnnotatedStore:
         return len(self.ids())
 
     def ids(self, split: str | None = None) -> list[str]:
-        """Clips with sentences, of one subset of the chosen split or all, in the store's order.
+        """Return the clips with sentences in the store's order, of one subset of the chosen split or all.
 
-        Raises BadInput for what is the name of no subset.
+        Raises BadInput for an unknown subset.
         """
         if split not in (None, *SUBSETS):
             raise BadInput("split", f"one of {', '.join(SUBSETS)}, or None for all clips", repr(split), "correct it")
@@ -103,7 +107,7 @@ class AnnotatedStore:
 
     @property
     def missing_subsets(self) -> dict[str, str]:
-        """Subsets of the chosen split without clips, with what that means in words."""
+        """Empty subsets of the chosen split, with the consequence as text."""
         return self.split_info.get("missing", {})
 
     @property
@@ -113,7 +117,7 @@ class AnnotatedStore:
 
     @property
     def contact_threshold_m(self) -> float:
-        """The contact stage's: contact maps and distances hold what is closer, metres."""
+        """The contact stage's threshold: contact maps and distances contain pairs that are closer, metres."""
         return float(self.contact_info["threshold_m"])
 
     def clip(self, clip_id: str) -> Clip:
@@ -124,73 +128,76 @@ class AnnotatedStore:
         return self.store.joints(clip_id, side)
 
     def hand_type(self, clip_id: str) -> HandType:
-        """The active hands, by the rule ``annotate.hand``. Raises KeyError with the reason for a clip without any."""
-        found = self.hand_types.at[clip_id, "hand_type"]
-        if found not in ("left", "right", "both"):
-            raise KeyError(f"no hand acts in {clip_id}: {self.hand_types.at[clip_id, 'reason']}")
-        return found
+        """Return the active hands by the rule ``annotate.hand``. Raises KeyError with the reason if there are none."""
+        hand_type = self.hand_types.at[clip_id, "hand_type"]
+        if hand_type not in ("left", "right", "both"):
+            raise KeyError(f"no active hand in {clip_id}: {self.hand_types.at[clip_id, 'reason']}")
+        return hand_type
 
     def hand_evidence(self, clip_id: str, threshold_m: float | None = None) -> HandEvidence:
-        """How near each hand comes in every frame, and the hand type at ``threshold_m``, by default the stage's own.
+        """Read the distance of each hand in each frame, and the hand type at ``threshold_m``.
 
-        Kept by the stage annotate: nothing is computed. Per-frame distances are rounded to float32 (1 nm at 2 cm); the
-        clip's hand type rests on the exact smallest ones.
+        Per-frame distances are rounded to float32 (1 nm at 2 cm). The hand type uses the exact smallest distances.
+
+        Args:
+            clip_id: the clip.
+            threshold_m: a hand is active below it, metres; by default the threshold of the stage annotate.
         """
         if self._hand_distances is None:
             self._hand_distances = HandDistances(self.root / "annotation" / "hand_distance.npz", len(self.store.ids))
-        row = self.hand_types.index.get_loc(clip_id)
-        assert isinstance(row, int)
+        index = self.hand_types.index.get_loc(clip_id)
+        assert isinstance(index, int)
         smallest: dict[Side, float] = {}
         for side in SIDES:
             value = self.hand_types.at[clip_id, f"min_{side}_m"]
             smallest[side] = np.inf if pd.isna(value) else float(value)
-        judged_m: float = self.annotation_info["threshold_m"] if threshold_m is None else threshold_m
-        return HandEvidence(None, self._hand_distances.of(row), judged_m, smallest).at_threshold(judged_m)
+        limit_m: float = self.annotation_info["threshold_m"] if threshold_m is None else threshold_m
+        return HandEvidence(None, self._hand_distances.of(index), limit_m, smallest).at_threshold(limit_m)
 
     def sentences(self, clip_id: str) -> tuple[str, ...]:
-        """Imperative, passive, subject and gerund form."""
+        """Return the sentences of a clip, one of each form (``hoidata.annotation.sentences``)."""
         return tuple(self._sentences[clip_id]["sentence"])
 
     def text_embedding(self, clip_id: str) -> np.ndarray:
-        """(4, 512) float32 features of the four sentences, of the encoder ``encoder_identity``."""
+        """Return (form, 512) float32 features of the clip's sentences, from the encoder ``encoder_identity``."""
         return self._features[self._sentences[clip_id]["text_row"].to_numpy()]
 
     def object_key(self, clip_id: str) -> str:
-        """Name of the manipulated object within this dataset."""
+        """Return the key of the manipulated object in this store."""
         return str(self.store.sequences.at[clip_id, "object"])
 
     def object_model(self, object_key: str) -> ObjectModel:
         return self.store.object_model(object_key)
 
     def points(self, object_key: str) -> SampledPoints:
-        """The sampled points of an object, in its own frame with the hinge at zero."""
-        row = int(self._objects.at[object_key, "row"])
-        arrays = {name: array[row] for name, array in self._points.items()}
+        """Return the sampled points of an object, in the object frame with the hinge at zero."""
+        index = int(self._objects.at[object_key, "row"])
+        arrays = {name: array[index] for name, array in self._points.items()}
         return SampledPoints(**arrays, method=self._objects.at[object_key, "method"])
 
     def contact_of(self, clip_id: str, side: Side) -> np.ndarray:
-        """(1024,) uint8: points one hand touches in any frame of the clip."""
+        """Return (1024,) uint8: 1 for points that one hand touches in any frame of the clip."""
         return (self.touched_frames(clip_id, side) > 0).astype(np.uint8)
 
     def contact(self, clip_id: str) -> np.ndarray:
-        """(1024,) uint8: points any hand touches in any frame of the clip, Text2HOI's contact map."""
+        """Return (1024,) uint8: 1 for points that a hand touches in any frame; the contact map of Text2HOI."""
         return np.maximum(self.contact_of(clip_id, "left"), self.contact_of(clip_id, "right"))
 
     def touched_frames(self, clip_id: str, side: Side) -> np.ndarray:
-        """(1024,) uint16: in how many frames one hand touches each point."""
+        """Return (1024,) uint16: the number of frames in which one hand touches each point."""
         return self._contact[f"{side}_frames"][int(self._clips.at[clip_id, "row"])]
 
     def distances(self, clip_id: str, side: Side | None = None) -> DistanceEntries:
-        """All joint-point distances under the threshold, of one hand or of both (left first)."""
+        """Return all joint-point distances below the threshold, of one hand or of both (left first)."""
         sides = SIDES if side is None else (side,)
         columns_of_sides = [self._entries(clip_id, name) for name in sides]
         columns = [np.concatenate(column) for column in zip(*columns_of_sides, strict=True)]
         return DistanceEntries(*columns)
 
     def _entries(self, clip_id: str, side: Side) -> tuple[np.ndarray, ...]:
-        row = self._clips.loc[clip_id]
-        rows = slice(int(row[f"{side}_start"]), int(row[f"{side}_stop"]))
-        shard = self._shard(int(row["shard"]))
+        clip = self._clips.loc[clip_id]
+        rows = slice(int(clip[f"{side}_start"]), int(clip[f"{side}_stop"]))
+        shard = self._shard(int(clip["shard"]))
         frame, joint, point = (shard[name][rows].astype(np.int64) for name in ("frame", "joint", "point"))
         number = np.full(len(frame), SIDES.index(side), np.int64)
         return number, frame, joint, point, np.array(shard["distance_m"][rows])
@@ -201,16 +208,16 @@ class AnnotatedStore:
         return self._distances[number]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Workers map the distances anew: a pickled memory map would carry all of them."""
+        """Leave out memory maps, which would pickle whole files: each worker maps the files again."""
         return {**self.__dict__, "_distances": {}, "_hand_distances": None}
 
     def _refuse_other_clips(self) -> None:
-        """Raise BadInput when a stage's output belongs to another conversion than the clips beside it."""
+        """Raise BadInput if the output of a stage belongs to another conversion than the clips."""
         tables = {"annotation": self.hand_types.index, "contact": self._clips.index, "splits": self.splits}
-        for folder, found in tables.items():
-            if list(found) != self.store.ids:
-                got = f"{len(found)}, {len(set(found) & set(self.store.ids))} of them among these"
-                expected = f"the {len(self.store)} clips of the store beside it"
+        for folder, clip_ids in tables.items():
+            if list(clip_ids) != self.store.ids:
+                got = f"{len(clip_ids)} clips, {len(set(clip_ids) & set(self.store.ids))} in common"
+                expected = f"the {len(self.store)} clips of {self.store.folder}"
                 raise BadInput(self.root / folder, expected, got, "run its stage again")
 
 

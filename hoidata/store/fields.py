@@ -1,4 +1,4 @@
-"""Every field of a store, once: what the writer writes, the checker checks and README.md documents.
+"""Schema of a store: all fields of its files. The writer, the checker and README.md use this table.
 
 A store of another schema version is refused: convert its raw files again.
 """
@@ -18,22 +18,20 @@ UNITS = {"length": "metre", "angle": "radian", "time": "second"}
 
 @dataclass(frozen=True)
 class Field:
-    """One member of an array file, one column of a table, or one key of info.json.
-
-    dtype: of NumPy, Parquet or JSON. shape: numbers, or names of lengths that vary; () is one value. axes: what each
-    axis counts. unit: "" where there is none. frame: the frame of reference of coordinates, "" where there is none.
-    required: never null (tables, info.json); members of arrays are always there. choices: the only texts allowed.
-    """
+    """One member of an array file, one column of a table, or one key of info.json."""
 
     name: str
-    dtype: str
+    dtype: str  # of NumPy, Parquet or JSON
     meaning: str
-    shape: tuple[int | str, ...] = ()
-    axes: tuple[str, ...] = ()
+    shape: tuple[int | str, ...] = ()  # length of each axis, or a name if the length varies; () is a single value
+    axes: tuple[str, ...] = ()  # what each axis counts; by default the names in ``shape``
     unit: str = ""
-    frame: str = ""
-    required: bool = True
-    choices: tuple[str, ...] = ()
+    frame: str = ""  # frame of reference of coordinates
+    required: bool = True  # never null in a table or in info.json; members of arrays are never absent
+    choices: tuple[str, ...] = ()  # the allowed texts
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "axes", self.axes or tuple(name for name in self.shape if isinstance(name, str)))
 
     @property
     def row_shape(self) -> tuple[int, ...]:
@@ -43,51 +41,58 @@ class Field:
 
 @dataclass(frozen=True)
 class StoreFile:
-    """One file of a store, or one per shard (``frames-*.npz``). order: in which order its rows or members come."""
+    """One file of a store, or one file per shard (``frames-*.npz``)."""
 
     path: str
     meaning: str
-    order: str
+    order: str  # order of its rows or members
     fields: tuple[Field, ...]
 
 
 def _both(field: Field) -> tuple[Field, ...]:
-    """The field once per hand: ``<side>`` in its name and meaning becomes left and right."""
+    """Return the field for both hands: ``<side>`` in its name and meaning becomes left and right."""
     return tuple(
         replace(field, name=field.name.replace("<side>", s), meaning=field.meaning.replace("<side>", s)) for s in SIDES
     )
 
 
 def _rotvec(name: str, rows: str, meaning: str) -> Field:
-    return Field(name, "float32", meaning, (rows, 3), (rows, "axis-angle"), "radian", "world")
+    return Field(name, "float32", meaning, shape=(rows, 3), axes=(rows, "axis-angle"), unit="radian", frame="world")
 
 
 def _point(name: str, rows: str, meaning: str) -> Field:
-    return Field(name, "float32", meaning, (rows, 3), (rows, "xyz"), "metre", "world")
+    return Field(name, "float32", meaning, shape=(rows, 3), axes=(rows, "xyz"), unit="metre", frame="world")
 
 
 def _angles(name: str, rows: str, joints: int, meaning: str) -> Field:
     axes = (rows, "joint x axis-angle")
-    return Field(name, "float32", meaning, (rows, 3 * joints), axes, "radian", "parent joint")
+    return Field(name, "float32", meaning, shape=(rows, 3 * joints), axes=axes, unit="radian", frame="parent joint")
 
 
 def _hand(side: str) -> tuple[Field, ...]:
-    betas = Field(f"{side}_betas", "float32", "MANO shape", (f"{side} betas row", 10), ("betas row", "component"))
+    betas = Field(
+        f"{side}_betas", "float32", "MANO shape", shape=(f"{side} betas row", 10), axes=("betas row", "component")
+    )
     return (
-        _point(f"{side}_wrist_m", "frame", f"where joint 0 of the {side} hand is; not MANO's transl"),
-        _rotvec(f"{side}_global_orient", "frame", f"the {side} hand turns about its wrist joint"),
+        _point(f"{side}_wrist_m", "frame", f"position of joint 0 of the {side} hand; not MANO's transl"),
+        _rotvec(f"{side}_global_orient", "frame", f"rotation of the {side} hand about its wrist joint"),
         _angles(f"{side}_hand_pose", "frame", 15, f"finger joints of the {side} hand, absolute: zero is flat"),
-        Field(f"{side}_valid", "bool", "False: finite numbers that mean nothing", ("frame",), ("frame",)),
+        Field(
+            f"{side}_valid",
+            "bool",
+            "False: the hand is not tracked; its numbers are finite but meaningless",
+            shape=("frame",),
+        ),
         betas,
     )
 
 
-def _object(prefix: str, rows: str, what: str) -> tuple[Field, ...]:
-    hinge = f"unwrapped hinge angle of {what}; 0 for rigid ones"
+def _object(prefix: str, rows: str, target: str) -> tuple[Field, ...]:
+    hinge = f"unwrapped hinge angle of {target}; 0 for rigid ones"
     return (
-        _rotvec(f"{prefix}_rotvec", rows, f"world_from_object of {what}, column vectors"),
-        _point(f"{prefix}_translation_m", rows, f"origin of the object frame of {what}"),
-        Field(f"{prefix}_hinge_rad", "float32", hinge, (rows,), (rows,), "radian", "object"),
+        _rotvec(f"{prefix}_rotvec", rows, f"world_from_object of {target}, column vectors"),
+        _point(f"{prefix}_translation_m", rows, f"origin of the object frame of {target}"),
+        Field(f"{prefix}_hinge_rad", "float32", hinge, shape=(rows,), unit="radian", frame="object"),
     )
 
 
@@ -96,116 +101,159 @@ FRAMES = StoreFile(
     "motion; one file per shard, numbered from 00000",
     "clips of a shard one after another, in the order of sequences.parquet",
     (
-        Field("source_frames", "int32", "index in the source file, from 0, rising", ("frame",), ("frame",)),
+        Field("source_frames", "int32", "index in the source file, from 0, rising", shape=("frame",)),
         *_hand("left"),
         *_hand("right"),
         *_object("object", "frame", "the manipulated object"),
         *_object("other", "other object x frame", "the further objects, one after another"),
         _rotvec("camera_rotvec", "camera row", "world_from_camera, OpenCV axes (x right, y down, z ahead)"),
-        _point("camera_position_m", "camera row", "where the camera is"),
-        Field("camera_images", "int32", "number of the image in the source", ("camera row",), ("camera row",)),
+        _point("camera_position_m", "camera row", "position of the camera"),
+        Field("camera_images", "int32", "number of the image in the source", shape=("camera row",)),
     ),
-)  # fmt: skip
+)
 
 BODY = StoreFile(
     "arrays/body-*.npz",
-    "SMPL-X body parameters as the source gives them; there for shards with a clip that has some",
+    "SMPL-X body parameters of the source; only for shards with a clip that has them",
     "clips of a shard one after another",
     (
         _point("transl_m", "body row", "SMPL-X transl"),
         _rotvec("global_orient", "body row", "SMPL-X global orientation"),
         _angles("body_pose", "body row", 21, "SMPL-X body joints"),
         _angles("face_pose", "body row", 3, "jaw, left eye, right eye"),
-        Field("expression", "float32", "SMPL-X", ("expression row", 10), ("expression row", "component")),
+        Field("expression", "float32", "SMPL-X", shape=("expression row", 10), axes=("expression row", "component")),
     ),
 )
 
 SOURCE_CONTACT = StoreFile(
     "arrays/source_contact-*.npz",
-    "contact labels of the source, one row per touched vertex and frame; there for shards with a clip that has some",
+    "contact labels of the source, one row per touched vertex and frame; only for shards with a clip that has them",
     "clips of a shard one after another; within a clip by frame, then vertex",
     (
-        Field("frame", "int32", "frame of the clip, from 0", ("entry",), ("entry",)),
-        Field("vertex", "int32", "vertex of the clip's object mesh", ("entry",), ("entry",)),
-        Field("label", "uint8", "the source's own number of what touches", ("entry",), ("entry",)),
+        Field("frame", "int32", "frame of the clip, from 0", shape=("entry",)),
+        Field("vertex", "int32", "vertex of the clip's object mesh", shape=("entry",)),
+        Field("label", "uint8", "number of the touching body part, in the numbering of the source", shape=("entry",)),
     ),
 )
 
 OBJECT_ARRAYS = StoreFile(
     "arrays/objects.npz",
     "canonical meshes; every member is called <object>/<name>",
-    "members by name",
+    "alphabetical",
     (
-        Field("vertices_m", "float64", "hinge at zero", ("vertex", 3), ("vertex", "xyz"), "metre", "object"),
-        Field("faces", "int32", "vertices of each triangle", ("face", 3), ("face", "corner")),
-        Field("part", "uint8", "0 base, 1 the part the hinge moves", ("vertex",), ("vertex",)),
+        Field(
+            "vertices_m",
+            "float64",
+            "hinge at zero",
+            shape=("vertex", 3),
+            axes=("vertex", "xyz"),
+            unit="metre",
+            frame="object",
+        ),
+        Field("faces", "int32", "vertices of each triangle", shape=("face", 3), axes=("face", "corner")),
+        Field("part", "uint8", "0 base, 1 the part the hinge moves", shape=("vertex",)),
     ),
 )
 
 TEMPLATES = StoreFile(
     "arrays/templates.npz",
     "personal rest meshes; a member's name is the start of the SHA-256 of its bytes",
-    "members by name",
-    (Field("<template>", "float32", "replaces MANO's template", (N_VERTICES, 3), ("vertex", "xyz"), "metre", "hand"),),
+    "alphabetical",
+    (
+        Field(
+            "<template>",
+            "float32",
+            "replaces MANO's template",
+            shape=(N_VERTICES, 3),
+            axes=("vertex", "xyz"),
+            unit="metre",
+            frame="hand",
+        ),
+    ),
 )
 
 
 def _recorded(name: str, meaning: str, unit: str, frame: str = "world", joints: bool = False) -> Field:
     shape = ("frame", "joint", 3) if joints else ("frame", 3)
     axes = ("frame", "joint", "axis-angle") if joints else ("frame", "axis-angle" if unit == "radian" else "xyz")
-    return Field(name, "float32", meaning, shape, axes, unit, frame)
+    return Field(name, "float32", meaning, shape=shape, axes=axes, unit=unit, frame=frame)
 
 
 RECORDINGS = StoreFile(
     "arrays/recordings.npz",
-    "whole recordings at the source's own rate, hands with the source's own joints; there where info.json names some "
-    "under recordings; every member is called <sequence>/<name>",
-    "members by name",
+    "whole recordings at the frame rate and with the hand joints of the source, if info.json lists any under "
+    "recordings; every member is called <sequence>/<name>",
+    "alphabetical",
     (
-        *_both(_recorded("<side>_wrist_m", "where the <side> wrist is", "metre")),
-        *_both(_recorded("<side>_rotvec", "world_from_wrist of the <side> hand, then joints relative to their parents",
-                         "radian", "parent joint", joints=True)),
+        *_both(_recorded("<side>_wrist_m", "position of the <side> wrist", "metre")),
+        *_both(
+            _recorded(
+                "<side>_rotvec",
+                "world_from_wrist of the <side> hand, then joints relative to their parents",
+                "radian",
+                "parent joint",
+                joints=True,
+            )
+        ),
         _recorded("object_rotvec", "world_from_object, column vectors", "radian"),
         _recorded("object_translation_m", "origin of the object frame", "metre"),
-        Field("object_hinge_rad", "float32", "0 for rigid ones", ("frame",), ("frame",), "radian", "object"),
-        Field("usable", "bool", "False: tracking failed", ("frame",), ("frame",)),
+        Field("object_hinge_rad", "float32", "0 for rigid ones", shape=("frame",), unit="radian", frame="object"),
+        Field("usable", "bool", "False: tracking failed", shape=("frame",)),
     ),
-)  # fmt: skip
+)
 
 _JOINT, _CAPSULE = ("joint",), ("capsule",)
 
 
 def _of_hand(name: str, rows: str, meaning: str, frame: str = "joint", unit: str = "metre") -> Field:
-    return Field(name, "float64", meaning, (rows, 3), (rows, "xyz"), unit, frame)
+    return Field(name, "float64", meaning, shape=(rows, 3), axes=(rows, "xyz"), unit=unit, frame=frame)
 
 
 SOURCE_HANDS = StoreFile(
     "arrays/source_hands.npz",
     "the right hands of recordings.npz: skeleton, sensing skin, capsules; every member is called <hand>/<name>, "
     "and info.json names layout and joints under source_hands",
-    "members by name",
+    "alphabetical",
     (
-        Field("parents", "int64", "-1 for the wrist, which is first", _JOINT, _JOINT),
+        Field("parents", "int64", "parent joint; -1 for the wrist, the first joint", shape=_JOINT),
         _of_hand("offset_m", "joint", "from the parent", "parent joint"),
-        Field("rest_rotmats", "float64", "neutral pose, relative to parents", ("finger joint", 3, 3),
-              ("finger joint", "row", "column")),
+        Field(
+            "rest_rotmats",
+            "float64",
+            "neutral pose, relative to parents",
+            shape=("finger joint", 3, 3),
+            axes=("finger joint", "row", "column"),
+        ),
         _of_hand("skin_point_m", "skin point", "the five tips, then the proximity sensors, at rest", "skin"),
         _of_hand("skin_normal", "skin point", "outward", "skin", ""),
-        Field("skin_weight", "float64", "of linear blend skinning", ("skin point", "joint"), ("skin point", "joint")),
-        Field("joint_from_skin", "float64", "rotations at rest", ("joint", 3, 3), ("joint", "row", "column")),
+        Field("skin_weight", "float64", "of linear blend skinning", shape=("skin point", "joint")),
+        Field(
+            "joint_from_skin", "float64", "rotations at rest", shape=("joint", 3, 3), axes=("joint", "row", "column")
+        ),
         _of_hand("joint_from_skin_m", "joint", "the skin frame's origin at rest"),
-        Field("tip_joint", "int64", "last joint of each finger", ("finger",), ("finger",)),
-        Field("capsule_joint", "int64", "what each moves with", _CAPSULE, _CAPSULE),
-        _of_hand("capsule_start_m", "capsule", "middle of the first sphere"),
-        _of_hand("capsule_end_m", "capsule", "middle of the last sphere"),
-        Field("capsule_radius_m", "float64", "of the spheres", _CAPSULE, _CAPSULE, "metre"),
-        Field("wrist_from_canonical", "float64", "columns: to the fingers, to the thumb, out of the back", (3, 3),
-              ("row", "column")),
-        _of_hand("hinge_axis", "joint", "unit, or zero for joints that turn freely", unit=""),
-        Field("limit_rad", "float64", "least and most angle from the neutral pose", ("joint", 2), ("joint", "value"),
-              "radian"),
+        Field("tip_joint", "int64", "last joint of each finger", shape=("finger",)),
+        Field("capsule_joint", "int64", "joint that each capsule moves with", shape=_CAPSULE),
+        _of_hand("capsule_start_m", "capsule", "centre of the first sphere"),
+        _of_hand("capsule_end_m", "capsule", "centre of the last sphere"),
+        Field("capsule_radius_m", "float64", "of the spheres", shape=_CAPSULE, unit="metre"),
+        Field(
+            "wrist_from_canonical",
+            "float64",
+            "columns: to the fingers, to the thumb, out of the back",
+            shape=(3, 3),
+            axes=("row", "column"),
+        ),
+        _of_hand("hinge_axis", "joint", "unit vector; zero for ball joints", unit=""),
+        Field(
+            "limit_rad",
+            "float64",
+            "minimum and maximum angle from the neutral pose",
+            shape=("joint", 2),
+            axes=("joint", "value"),
+            unit="radian",
+        ),
     ),
-)  # fmt: skip
+)
 
 _TEXT, _WHOLE, _ROW = "string", "int32", "int64"
 
@@ -217,50 +265,70 @@ def _rows_of(name: str, array: str, optional: bool = False) -> Field:
 SEQUENCES = StoreFile(
     "meta/sequences.parquet",
     "one row per clip",
-    "as written; a conversion writes sequences by their key, the clips of one in the order of its frames",
+    "as written; a conversion writes sequences by key, and the clips of a sequence in the order of their frames",
     (
-        Field("clip_id", _TEXT, "unique; made from the source's own names, never from a position in a list"),
+        Field("clip_id", _TEXT, "unique; consists of names of the source, not of positions in a list"),
         Field("dataset", _TEXT, "name of the dataset"),
         Field("subject", _TEXT, "as in the source"),
         Field("sequence", _TEXT, "the source sequence it was cut from"),
-        Field("verb", _TEXT, "the action in words; null without a label", required=False),
+        Field("verb", _TEXT, "the action; null without a label", required=False),
         Field("object_words", _TEXT, "noun of the object, without article"),
         Field("labelled_hand", _TEXT, "the hand an annotator named", required=False, choices=("left", "right", "both")),
         Field("object", _TEXT, "the manipulated object: its row in objects.parquet"),
-        Field("other_objects", _TEXT, "further objects of the scene", ("other object",), ("other object",)),
+        Field("other_objects", _TEXT, "further objects of the scene", shape=("other object",)),
         Field("n_frames", _WHOLE, "frames at 30 per second"),
         Field("shard", _WHOLE, "number of its frames-, body- and source_contact- file"),
         _rows_of("first_row", "the frame arrays"),
         Field("articulated", "bool", "whether the object has a hinge"),
         *_both(_rows_of("<side>_betas_row", "<side>_betas")),
         *_both(Field("<side>_betas_count", _WHOLE, "rows of <side>_betas: 1, or one per frame")),
-        *_both(Field("<side>_template", _TEXT, "member of templates.npz, null for MANO's own", required=False)),
+        *_both(
+            Field("<side>_template", _TEXT, "member of templates.npz, null for the template of MANO", required=False)
+        ),
         *_both(Field("<side>_valid_frames", _WHOLE, "how many frames of <side>_valid are True")),
         _rows_of("other_row", "the other_ arrays; object k follows k * n_frames later"),
         Field(
-            "gravity", "float64", "unit vector in which things fall; null when not known", (3,), ("xyz",), "", "world",
+            "gravity",
+            "float64",
+            "unit vector of gravity; null if unknown",
+            shape=(3,),
+            axes=("xyz",),
+            frame="world",
             required=False,
         ),
         Field(
-            "source_from_world", "float64", "homogeneous, by rows: to the source's own frame and unit", (16,),
-            ("row x column",),
+            "source_from_world",
+            "float64",
+            "homogeneous matrix, row by row: to the frame and unit of the source",
+            shape=(16,),
+            axes=("row x column",),
         ),
         Field("source_fps", "float64", "rate of the source file", unit="1 / second"),
         Field("first_source_frame", _WHOLE, "first of source_frames"),
         Field("last_source_frame", _WHOLE, "last of source_frames"),
-        Field("source_files", _WHOLE, "rows of files.parquet it was read from", ("file",), ("file",)),
+        Field("source_files", _WHOLE, "rows of files.parquet it was read from", shape=("file",)),
         Field("synthetic", "bool", "whether the raw data was generated"),
         Field(
-            "gravity_note", _TEXT, "how gravity was estimated, or why it is not known; empty when the source states it",
+            "gravity_note",
+            _TEXT,
+            "how gravity was estimated, or why it is unknown; empty if the source states it",
         ),
-        Field("hands_from", _TEXT, "what the source gave", choices=("parameters", "keypoints")),
+        Field("hands_from", _TEXT, "what the source provides", choices=("parameters", "keypoints")),
         Field(
-            "fit_error_m", "float64", "mean error of hands fitted to keypoints; null for parameters", unit="metre",
+            "fit_error_m",
+            "float64",
+            "mean error of hands fitted to keypoints; null for parameters",
+            unit="metre",
             required=False,
         ),
         Field("camera_name", _TEXT, "as in the source; null without a camera", required=False),
         Field(
-            "camera_intrinsics", "float64", "fx, fy, cx, cy, width, height", (6,), ("value",), "pixel",
+            "camera_intrinsics",
+            "float64",
+            "fx, fy, cx, cy, width, height",
+            shape=(6,),
+            axes=("value",),
+            unit="pixel",
             required=False,
         ),
         _rows_of("camera_row", "the camera_ arrays", optional=True),
@@ -269,7 +337,7 @@ SEQUENCES = StoreFile(
         _rows_of("source_contact_row", "the arrays of source_contact-*.npz", optional=True),
         Field("source_contact_count", _ROW, "how many rows; 0 for a clip without"),
     ),
-)  # fmt: skip
+)
 
 OBJECTS = StoreFile(
     "meta/objects.parquet",
@@ -280,14 +348,28 @@ OBJECTS = StoreFile(
         Field("n_vertices", _WHOLE, "vertices"),
         Field("n_faces", _WHOLE, "triangles"),
         Field("articulated", "bool", "whether it has a hinge"),
-        Field("hinge_axis", "float64", "unit vector; null when rigid", (3,), ("xyz",), "", "object", required=False),
         Field(
-            "hinge_origin_m", "float64", "a point of the hinge; null when rigid", (3,), ("xyz",), "metre", "object",
+            "hinge_axis",
+            "float64",
+            "unit vector; null when rigid",
+            shape=(3,),
+            axes=("xyz",),
+            frame="object",
+            required=False,
+        ),
+        Field(
+            "hinge_origin_m",
+            "float64",
+            "a point of the hinge; null when rigid",
+            shape=(3,),
+            axes=("xyz",),
+            unit="metre",
+            frame="object",
             required=False,
         ),
         Field("digest", _TEXT, "SHA-256 of vertices_m, faces, part, hinge_axis and hinge_origin_m, in that order"),
     ),
-)  # fmt: skip
+)
 
 FILES = StoreFile(
     "meta/files.parquet",
@@ -302,21 +384,21 @@ FILES = StoreFile(
 
 QUARANTINE = StoreFile(
     "meta/quarantine.parquet",
-    "what was left out",
+    "rejected sequences and clips",
     "as written",
     (
         Field("source_key", _TEXT, "the sequence, or the clip"),
         Field("where", _TEXT, "the file or field"),
-        Field("expected", _TEXT, "what had to be there"),
-        Field("got", _TEXT, "what was there"),
+        Field("expected", _TEXT, "the requirement"),
+        Field("got", _TEXT, "the value in the file"),
         Field("remedy", _TEXT, "what to do"),
     ),
 )
 
 INFO = StoreFile(
     "meta/info.json",
-    "facts of the whole store; a dot means a key inside; further keys are free, conversions add some",
-    "keys by name",
+    "facts of the whole store; a dot separates nested keys; further keys are allowed, conversions add some",
+    "alphabetical",
     (
         Field("schema_version", "string", "major.minor.patch"),
         Field("dataset", "string", "name of the dataset, lower case"),
@@ -329,17 +411,17 @@ INFO = StoreFile(
         Field("units.time", "string", "second"),
         Field("axes", "object", "what the axes of each member of frames-*.npz count"),
         Field("frame.handedness", "string", "of the world frame", choices=("right",)),
-        Field("frame.up_axis", "string", "null when the source does not say", required=False,
+        Field("frame.up_axis", "string", "null if the source does not state it", required=False,
               choices=("+x", "-x", "+y", "-y", "+z", "-z")),
-        Field("frame.gravity", "string", "where gravity comes from", choices=("stated", "estimated", "unknown")),
+        Field("frame.gravity", "string", "source of gravity", choices=("stated", "estimated", "unknown")),
         Field("frame.note", "string", "one sentence for people"),
         Field("hand_model.name", "string", "mano, or embedded"),
         Field("hand_model.digest", "string", "SHA-256 of the hand model the parameters belong to"),
         Field("hand_convention.left_shape", "string", "sign of the left hand's shape directions in the source",
               choices=("as released", "corrected", "unused", "unknown")),
-        Field("hand_convention.note", "string", "what the source's hand parameters meant"),
+        Field("hand_convention.note", "string", "meaning of the hand parameters of the source"),
         Field("licence", "string", "of the raw data"),
-        Field("may_be_shared", "boolean", "whether the licence lets derived data be passed on"),
+        Field("may_be_shared", "boolean", "whether the licence allows sharing derived data"),
         Field("counts.clips", "integer", "rows of sequences.parquet"),
         Field("counts.frames", "integer", "sum of n_frames"),
         Field("counts.objects", "integer", "rows of objects.parquet"),
@@ -363,17 +445,17 @@ _ARROW = {
 
 
 def arrow_schema(file: StoreFile) -> pa.Schema:
-    """The Parquet schema of a table; fields with an axis are lists."""
+    """Return the Parquet schema of a table; fields with an axis are lists."""
     return pa.schema([(f.name, pa.list_(_ARROW[f.dtype]) if f.shape else _ARROW[f.dtype]) for f in file.fields])
 
 
 def empty_array(field: Field) -> np.ndarray:
-    """An array of that field without rows."""
+    """Return an array of the field with no rows."""
     return np.zeros((0, *field.row_shape), field.dtype)
 
 
 def value_at(info: Any, name: str) -> Any:
-    """The value of a dotted key of info.json. Raises KeyError when it is not there."""
+    """Return the value of a dotted key of info.json. Raises KeyError if it is missing."""
     for key in name.split("."):
         if not isinstance(info, dict) or key not in info:
             raise KeyError(name)

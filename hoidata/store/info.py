@@ -1,4 +1,4 @@
-"""The facts of a whole store: what its writer has to say, and how they are checked."""
+"""Facts of a whole store (``meta/info.json``): their layout and their check."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -10,13 +10,13 @@ from hoidata.errors import BadInput
 from hoidata.hands import HandPair, load_embedded_hands
 from hoidata.store.fields import INFO, Field, value_at
 
-_WHERE = "meta/info.json"
-# Of real recordings with the embedded hand, compared with published joints of MANO.
-STAND_IN_ERROR = (
+_PATH = "meta/info.json"
+# Error of the embedded hand on real recordings, compared with the published joints of MANO.
+EMBEDDED_HAND_ERROR = (
     "joints are off by 21 to 37 mm on average and wrists by 6 to 11 mm, so contact is off too; "
     "convert with the MANO files (--hand FOLDER)"
 )
-_OF_THE_WRITER = ("schema_version", "fps", "units", "axes", "counts")
+_WRITER_KEYS = ("schema_version", "fps", "units", "axes", "counts")
 _TYPES: dict[str, type | tuple[type, ...]] = {
     "string": str, "boolean": bool, "integer": int, "number": (int, float), "object": dict,
 }  # fmt: skip
@@ -35,9 +35,13 @@ def store_info(
     synthetic: bool,
     **further: Any,
 ) -> dict[str, Any]:
-    """All facts ``write_store`` requires, in the layout of ``meta/info.json``; ``further`` keys are added as given.
+    """Return all facts that ``write_store`` requires, in the layout of ``meta/info.json``.
 
-    dataset: its name. hands: the model the parameters belong to. The other facts are those of an Adapter.
+    Args:
+        dataset: name of the dataset.
+        hands: hand model that the parameters belong to.
+        frame, hand_convention, dataset_version, licence, may_be_shared, source_fps, synthetic: as in ``Adapter``.
+        further: keys to add.
     """
     return {
         "dataset": dataset,
@@ -54,19 +58,21 @@ def store_info(
 
 
 def stand_in_note(info: Mapping[str, Any]) -> str:
-    """What to say of a store of MANO parameters that was converted with the embedded hand in MANO's place; else "".
+    """Return a warning if MANO parameters were converted with the embedded hand; else "".
 
-    Generated raw files were made with the embedded hand, and fitted hands are fitted to the hand that is there: both
-    are right with it. info: of a store, or what ``store_info`` gives.
+    Generated raw files and fitted hands are exact with the embedded hand, so they give no warning.
+
+    Args:
+        info: ``meta/info.json`` of a store, or the result of ``store_info``.
     """
-    is_right = info["synthetic"] or info["hand_convention"]["shape"] == "fitted"
-    if is_right or info["hand_model"]["name"] != load_embedded_hands().right.name:
+    is_exact = info["synthetic"] or info["hand_convention"]["shape"] == "fitted"
+    if is_exact or info["hand_model"]["name"] != load_embedded_hands().right.name:
         return ""
-    return f"{info['dataset']} has MANO parameters, and the embedded hand is no MANO: {STAND_IN_ERROR}"
+    return f"{info['dataset']} has MANO parameters, and the embedded hand is not MANO: {EMBEDDED_HAND_ERROR}"
 
 
 def generated_info(dataset: str, hands: HandPair | None = None, **further: Any) -> dict[str, Any]:
-    """The facts of a store whose clips were made by code, in a world with z up. hands: the embedded ones by default."""
+    """Return the facts of a store of generated clips with z up. hands: the embedded hands by default."""
     facts = store_info(
         dataset,
         hands or load_embedded_hands(),
@@ -82,17 +88,14 @@ def generated_info(dataset: str, hands: HandPair | None = None, **further: Any) 
 
 
 def check_info(info: dict[str, Any]) -> None:
-    """Raise BadInput that names the first required fact which is missing or of the wrong kind.
-
-    Facts the writer itself adds (version, units, counts) are not looked at.
-    """
+    """Raise BadInput for the first required fact that is missing or invalid, except facts that the writer adds."""
     for problem in info_problems(info):
-        if problem.where.removeprefix(f"{_WHERE}: ").split(".")[0] not in _OF_THE_WRITER:
+        if problem.where.removeprefix(f"{_PATH}: ").split(".")[0] not in _WRITER_KEYS:
             raise problem
 
 
 def info_problems(info: Any) -> list[BadInput]:
-    """Every fact that a store must state and does not, or not as documented."""
+    """Return a problem for each required fact that is missing or differs from the schema."""
     problems = []
     for field in INFO.fields:
         try:
@@ -100,12 +103,12 @@ def info_problems(info: Any) -> list[BadInput]:
         except KeyError:
             problems.append(_problem(field, "nothing"))
             continue
-        if not _is_of(field, value):
+        if not _is_valid(field, value):
             problems.append(_problem(field, repr(value)))
     return problems
 
 
-def _is_of(field: Field, value: Any) -> bool:
+def _is_valid(field: Field, value: Any) -> bool:
     if value is None:
         return not field.required
     if not isinstance(value, _TYPES[field.dtype]) or (isinstance(value, bool) and field.dtype != "boolean"):
@@ -117,5 +120,5 @@ def _problem(field: Field, got: str) -> BadInput:
     kind = f"one of {', '.join(field.choices)}" if field.choices else f"a {field.dtype}"
     expected = f"{kind} ({field.meaning})" if field.required else f"{kind} or null ({field.meaning})"
     return BadInput(
-        f"{_WHERE}: {field.name}", expected, got, "pass hoidata.store.info.store_info(...), or convert again"
+        f"{_PATH}: {field.name}", expected, got, "pass hoidata.store.info.store_info(...), or convert again"
     )

@@ -1,4 +1,4 @@
-"""Whole recordings of a store as arrays, and back: ``arrays/recordings.npz`` and ``arrays/source_hands.npz``."""
+"""Converts whole recordings to and from the arrays of ``arrays/recordings.npz`` and ``arrays/source_hands.npz``."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -17,7 +17,7 @@ _DIGITS = 16
 
 
 class RecordingWriter:
-    """Collects the arrays of recordings and, once each, those of their hands."""
+    """Collects the arrays of recordings and of their hands; each distinct hand once."""
 
     def __init__(self) -> None:
         self.arrays: dict[str, np.ndarray] = {}
@@ -26,10 +26,10 @@ class RecordingWriter:
         self.hand_facts: dict[str, dict[str, Any]] = {}
 
     def add(self, recording: HandRecording, object_key: Any, source_files: list[int]) -> None:
-        """A second recording of a sequence takes the place of the first."""
-        named = _recording_arrays(recording)
+        """Add a recording. It replaces an earlier recording of the same sequence."""
+        by_name = _recording_arrays(recording)
         for field in RECORDINGS.fields:
-            self.arrays[f"{recording.sequence}/{field.name}"] = np.ascontiguousarray(named[field.name], field.dtype)
+            self.arrays[f"{recording.sequence}/{field.name}"] = np.ascontiguousarray(by_name[field.name], field.dtype)
         self.facts[recording.sequence] = {
             "subject": recording.subject,
             "fps": recording.fps,
@@ -53,14 +53,14 @@ class RecordingWriter:
 def _recording_arrays(recording: HandRecording) -> dict[str, np.ndarray]:
     track = recording.object
     hinge = np.zeros(track.n_frames) if track.hinge_rad is None else track.hinge_rad
-    named = {"object_rotvec": track.rotvec, "object_translation_m": track.translation_m, "object_hinge_rad": hinge}
+    arrays = {"object_rotvec": track.rotvec, "object_translation_m": track.translation_m, "object_hinge_rad": hinge}
     for side, hand in recording.hands.items():
-        named |= {f"{side}_wrist_m": hand.wrist_m, f"{side}_rotvec": hand.rotvec}
-    return named | {"usable": recording.usable}
+        arrays |= {f"{side}_wrist_m": hand.wrist_m, f"{side}_rotvec": hand.rotvec}
+    return arrays | {"usable": recording.usable}
 
 
 def read_recording(
-    name: str,
+    sequence: str,
     dataset: str,
     facts: Mapping[str, Any],
     arrays: Mapping[str, np.ndarray],
@@ -68,18 +68,18 @@ def read_recording(
     model: ObjectModel,
     sources: tuple[SourceFile, ...],
 ) -> HandRecording:
-    """The recording of one sequence; facts are those of info.json, arrays the members of recordings.npz."""
-    own = {field.name: arrays[f"{name}/{field.name}"].copy() for field in RECORDINGS.fields}
-    hinge = own["object_hinge_rad"] if model.is_articulated else None
+    """Rebuild the recording of one sequence from its facts in info.json and the members of recordings.npz."""
+    members = {field.name: arrays[f"{sequence}/{field.name}"].copy() for field in RECORDINGS.fields}
+    hinge = members["object_hinge_rad"] if model.is_articulated else None
     return HandRecording(
         dataset=dataset,
         subject=facts["subject"],
-        sequence=name,
+        sequence=sequence,
         fps=facts["fps"],
         hand=hand,
-        hands={side: OwnHandTrack(own[f"{side}_wrist_m"], own[f"{side}_rotvec"]) for side in SIDES},
-        object=ObjectTrack(model, own["object_rotvec"], own["object_translation_m"], hinge),
-        usable=own["usable"],
+        hands={side: OwnHandTrack(members[f"{side}_wrist_m"], members[f"{side}_rotvec"]) for side in SIDES},
+        object=ObjectTrack(model, members["object_rotvec"], members["object_translation_m"], hinge),
+        usable=members["usable"],
         gravity=np.array(facts["gravity"]),
         sources=sources,
     )
@@ -110,21 +110,21 @@ def _hand_arrays(hand: TrackedHand) -> dict[str, np.ndarray]:
 
 
 def read_hand(key: str, facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> TrackedHand:
-    """A right hand; facts are those of info.json, arrays the members of source_hands.npz."""
-    own = {field.name: arrays[f"{key}/{field.name}"].copy() for field in SOURCE_HANDS.fields}
-    to_joint = RigidTransform(own["joint_from_skin"], own["joint_from_skin_m"])
+    """Rebuild a right hand from its facts in info.json and the members of source_hands.npz."""
+    members = {field.name: arrays[f"{key}/{field.name}"].copy() for field in SOURCE_HANDS.fields}
+    to_joint = RigidTransform(members["joint_from_skin"], members["joint_from_skin_m"])
     return TrackedHand(
         side="right",
         layout=facts["layout"],
         joint_names=tuple(facts["joints"]),
-        parents=own["parents"],
-        offset_m=own["offset_m"],
-        rest_rotmats=own["rest_rotmats"],
-        skin=Skin(own["skin_point_m"], own["skin_normal"], own["skin_weight"], to_joint),
-        tip_joint=own["tip_joint"],
-        capsules=JointCapsules(*(own[f"capsule_{name}"] for name in ("joint", "start_m", "end_m", "radius_m"))),
+        parents=members["parents"],
+        offset_m=members["offset_m"],
+        rest_rotmats=members["rest_rotmats"],
+        skin=Skin(members["skin_point_m"], members["skin_normal"], members["skin_weight"], to_joint),
+        tip_joint=members["tip_joint"],
+        capsules=JointCapsules(*(members[f"capsule_{name}"] for name in ("joint", "start_m", "end_m", "radius_m"))),
         middle_knuckle=facts["middle_knuckle"],
-        wrist_from_canonical=own["wrist_from_canonical"],
-        hinge_axis=own["hinge_axis"],
-        limit_rad=own["limit_rad"],
+        wrist_from_canonical=members["wrist_from_canonical"],
+        hinge_axis=members["hinge_axis"],
+        limit_rad=members["limit_rad"],
     )

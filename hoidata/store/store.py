@@ -1,12 +1,12 @@
-"""The unified store of one dataset: a folder of Parquet tables and stored NPZ arrays.
+"""Store of one dataset: a folder of Parquet tables and uncompressed NPZ arrays.
 
-``hoidata/store/README.md`` describes every file and field. In one line:
-``clip = open_store("data/embedded/grab/clips").clip("grab/s1/mug_drink_1")``. With plain NumPy::
+``hoidata/store/README.md`` describes the files and fields. To read a clip:
+``clip = open_store("data/embedded/grab/clips").clip("grab/s1/mug_drink_1")``. With NumPy and pandas alone::
 
-    rows = pandas.read_parquet("clips/meta/sequences.parquet").set_index("clip_id")
-    row = rows.loc["grab/s1/mug_drink_1"]
-    arrays = numpy.load(f"clips/arrays/frames-{row.shard:05d}.npz")
-    wrist_m = arrays["left_wrist_m"][row.first_row : row.first_row + row.n_frames]
+    sequences = pandas.read_parquet("clips/meta/sequences.parquet").set_index("clip_id")
+    clip = sequences.loc["grab/s1/mug_drink_1"]
+    arrays = numpy.load(f"clips/arrays/frames-{clip.shard:05d}.npz")
+    wrist_m = arrays["left_wrist_m"][clip.first_row : clip.first_row + clip.n_frames]
 
 """
 
@@ -48,51 +48,48 @@ _FURTHER_FACTS = ("synthetic", "gravity_note", "hands_from", "fit_error_m")
 
 
 def clip_rows(sequences: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """The row of every clip by its id, as Python values; a row of a pandas table costs more than reading the clip.
+    """Return the row of each clip by its id, as Python values.
 
-    Added: ``frames``, the rows of its shard; ``hands``, per side the rows of its betas and its template; ``facts``, the
-    fields of ``Clip`` that stand in the row as they are. gravity (3,) and source_from_world (4, 4) become arrays.
+    A dict, because the row of a pandas table costs more than reading the clip. Added keys: ``frames``, the clip's rows
+    of its shard; ``hands``, by side the rows of its betas and its template; ``columns``, the fields of ``Clip`` among
+    the columns. gravity (3,) and source_from_world (4, 4) become arrays.
     """
     rows = {}
-    for row in pa.Table.from_pandas(sequences, preserve_index=False).to_pylist():
-        row["frames"] = slice(row["first_row"], row["first_row"] + row["n_frames"])
-        row["hands"] = {side: _hand_rows(row, side) for side in SIDES}
-        row["facts"] = {name: row[name] for name in (*_FACTS, *_FURTHER_FACTS)}
-        row["gravity"] = None if row["gravity"] is None else np.array(row["gravity"])
-        row["source_from_world"] = np.array(row["source_from_world"]).reshape(4, 4)
-        rows[row["clip_id"]] = row
+    for facts in pa.Table.from_pandas(sequences, preserve_index=False).to_pylist():
+        facts["frames"] = slice(facts["first_row"], facts["first_row"] + facts["n_frames"])
+        facts["hands"] = {side: _hand_rows(facts, side) for side in SIDES}
+        facts["columns"] = {name: facts[name] for name in (*_FACTS, *_FURTHER_FACTS)}
+        facts["gravity"] = None if facts["gravity"] is None else np.array(facts["gravity"])
+        facts["source_from_world"] = np.array(facts["source_from_world"]).reshape(4, 4)
+        rows[facts["clip_id"]] = facts
     return rows
 
 
-def _hand_rows(row: dict[str, Any], side: Side) -> tuple[slice, str | None]:
-    first = row[f"{side}_betas_row"]
-    return slice(first, first + row[f"{side}_betas_count"]), row[f"{side}_template"]
+def _hand_rows(facts: dict[str, Any], side: Side) -> tuple[slice, str | None]:
+    first = facts[f"{side}_betas_row"]
+    return slice(first, first + facts[f"{side}_betas_count"]), facts[f"{side}_template"]
 
 
 @dataclass(frozen=True)
 class FrameShard:
-    """The mapped members of one ``frames-*.npz``.
-
-    hands: per side wrist_m, global_orient, hand_pose, betas, valid. object, other: rotvec, translation_m, hinge_rad.
-    camera: rotvec, position_m, images.
-    """
+    """The memory-mapped members of one ``frames-*.npz``."""
 
     source_frames: np.ndarray
-    hands: Mapping[Side, tuple[np.ndarray, ...]]
-    object: tuple[np.ndarray, ...]
-    other: tuple[np.ndarray, ...]
-    camera: tuple[np.ndarray, ...]
+    hands: Mapping[Side, tuple[np.ndarray, ...]]  # wrist_m, global_orient, hand_pose, betas, valid
+    object: tuple[np.ndarray, ...]  # rotvec, translation_m, hinge_rad
+    other: tuple[np.ndarray, ...]  # the same of the further objects
+    camera: tuple[np.ndarray, ...]  # rotvec, position_m, images
 
     @classmethod
     def open(cls, path: Path) -> "FrameShard":
         arrays = map_npz(path)
         names = ("wrist_m", "global_orient", "hand_pose", "betas", "valid")
         return cls(
-            arrays["source_frames"],
-            {side: tuple(arrays[f"{side}_{name}"] for name in names) for side in SIDES},
-            tuple(arrays[f"object_{name}"] for name in _POSE),
-            tuple(arrays[f"other_{name}"] for name in _POSE),
-            tuple(arrays[f"camera_{name}"] for name in ("rotvec", "position_m", "images")),
+            source_frames=arrays["source_frames"],
+            hands={side: tuple(arrays[f"{side}_{name}"] for name in names) for side in SIDES},
+            object=tuple(arrays[f"object_{name}"] for name in _POSE),
+            other=tuple(arrays[f"other_{name}"] for name in _POSE),
+            camera=tuple(arrays[f"camera_{name}"] for name in ("rotvec", "position_m", "images")),
         )
 
 
@@ -102,8 +99,13 @@ __all__ = ["SCHEMA_VERSION", "Quarantined", "Store", "open_store", "write_store"
 def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
     """Open a store for reading.
 
-    hands: the hand model its parameters belong to; not needed when that is the embedded one, or when no joints are
-    asked for. Raises MissingResource when ``folder`` is no store, BadInput for another schema version or other hands.
+    Args:
+        folder: the store.
+        hands: hand model of its parameters. Only ``joints`` needs it, and only if it is not the embedded hand.
+
+    Raises:
+        MissingResource: ``folder`` is not a store.
+        BadInput: the store has another schema version or another hand model.
     """
     folder = Path(folder)
     info = read_info(folder)
@@ -119,20 +121,24 @@ def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
     sequences = sequences.set_index("clip_id", drop=False).rename_axis(None)
     if problems := info_problems(info):
         raise BadInput(folder / problems[0].where, problems[0].expected, problems[0].got, REMEDY)
-    return Store(folder, info, sequences, objects, files, quarantine, hands)
+    return Store(
+        folder=folder, info=info, sequences=sequences, objects=objects, files=files, quarantine=quarantine, hands=hands
+    )
 
 
 def read_info(folder: str | Path) -> dict[str, Any]:
-    """``meta/info.json`` as it is on disk.
+    """Read ``meta/info.json``.
 
-    Raises MissingResource when ``folder`` is no store, BadInput when the file is no JSON object or of another version.
+    Raises:
+        MissingResource: ``folder`` is not a store, or is empty for a stated reason.
+        BadInput: the file is invalid or of another schema version.
     """
     path = Path(folder) / "meta" / "info.json"
-    for noted in (Path(folder), Path(folder).parent):  # a family without motions has the note in the place of clips/
-        if not path.is_file() and (reason := empty_reason(noted)):
-            raise MissingResource(f"{noted} is empty: {reason}")
+    for parent in (Path(folder), Path(folder).parent):  # a family without motions has empty.json instead of clips/
+        if not path.is_file() and (reason := empty_reason(parent)):
+            raise MissingResource(f"{parent} is empty: {reason}")
     if not path.is_file():
-        raise MissingResource(f"{folder} is no store: {path} is missing; run the conversion of this dataset first")
+        raise MissingResource(f"{folder} is not a store: {path} is missing; run the conversion of this dataset first")
     info = read_json(path)
     if info["schema_version"] != SCHEMA_VERSION:
         remedy = "run the conversion again, or use the hoidata that wrote it"
@@ -142,11 +148,11 @@ def read_info(folder: str | Path) -> dict[str, Any]:
 
 @dataclass
 class Store:
-    """One dataset's clips. sequences (indexed by clip id), objects, files, quarantine: pandas tables; info: a dict."""
+    """The clips of one dataset."""
 
     folder: Path
-    info: dict[str, Any]
-    sequences: pd.DataFrame
+    info: dict[str, Any]  # meta/info.json
+    sequences: pd.DataFrame  # under clip ids
     objects: pd.DataFrame
     files: pd.DataFrame
     quarantine: pd.DataFrame
@@ -158,7 +164,7 @@ class Store:
     _sources: list[SourceFile] = field(default_factory=list, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Workers open the array files anew: a pickled memory map would carry the whole dataset."""
+        """Leave out memory maps, which would pickle the whole dataset: each worker opens the files again."""
         return {**self.__dict__, "_arrays": {}, "_models": {}, "_shards": {}, "_rows": {}, "_sources": []}
 
     def __len__(self) -> int:
@@ -169,33 +175,35 @@ class Store:
         return self.sequences["clip_id"].tolist()
 
     def clip(self, clip_id: str, *, motion_only: bool = False) -> Clip:
-        """The clip as it was written, float32. Raises KeyError when there is none of that id.
+        """Read a clip, float32. Raises KeyError for an unknown id.
 
-        motion_only: without camera, body and the source's contact labels, which can be larger than all the rest.
+        Args:
+            clip_id: the clip.
+            motion_only: skip camera, body and contact labels of the source, which can be larger than all the rest.
         """
-        row = self._row(clip_id)
-        frames, shard, gravity = row["frames"], self._frames(row["shard"]), row["gravity"]
+        facts = self._facts(clip_id)
+        frames, shard, gravity = facts["frames"], self._frames(facts["shard"]), facts["gravity"]
         return Clip(
-            hands={side: self._hand(row, side) for side in SIDES},
-            object=self._object(row["object"], shard.object, frames),
-            other_objects=self._other_objects(row, shard) if row["other_objects"] else (),
+            hands={side: self._hand(facts, side) for side in SIDES},
+            object=self._object(facts["object"], shard.object, frames),
+            other_objects=self._other_objects(facts, shard) if facts["other_objects"] else (),
             source_frames=shard.source_frames[frames].copy(),
             gravity=None if gravity is None else gravity.copy(),
-            source_from_world=row["source_from_world"].copy(),
-            sources=self._sources_of(row),
-            camera=None if motion_only else self._camera(row, shard),
-            body=None if motion_only else self._body(row),
-            source_contact=None if motion_only else self._source_contact(row),
-            **row["facts"],
+            source_from_world=facts["source_from_world"].copy(),
+            sources=self._sources_of(facts),
+            camera=None if motion_only else self._camera(facts, shard),
+            body=None if motion_only else self._body(facts),
+            source_contact=None if motion_only else self._source_contact(facts),
+            **facts["columns"],
         )
 
     @property
     def recordings(self) -> list[str]:
-        """The sequences whose whole recording is kept, with the hands as the source has them."""
+        """The sequences whose whole recording is stored, with the hand skeleton of the source."""
         return sorted(self.info.get("recordings", {}))
 
     def recording(self, sequence: str) -> HandRecording:
-        """One of ``recordings``. Raises KeyError when there is none of that name."""
+        """Read one of ``recordings``. Raises KeyError for an unknown sequence."""
         if sequence not in self.recordings:
             raise KeyError(f"no recording {sequence!r} in {self.folder}; there are: {', '.join(self.recordings)}")
         facts = self.info["recordings"][sequence]
@@ -204,11 +212,11 @@ class Store:
         return read_recording(sequence, self.info["dataset"], facts, self._file("recordings"), hand, model, sources)
 
     def joints(self, clip_id: str, side: Side) -> np.ndarray:
-        """(frame, 21, 3) float32 world joints of one hand, metres, valid frames or not (see ``HandTrack.valid``)."""
-        return track_joints(self._hand(self._row(clip_id), side), self.hand_pair()[side])
+        """Return (frame, 21, 3) float32 world joints of one hand, metres, in valid and invalid frames."""
+        return track_joints(self._hand(self._facts(clip_id), side), self.hand_pair()[side])
 
     def hand_pair(self) -> HandPair:
-        """The hand model of this store. Raises MissingResource when it needs the user's MANO files."""
+        """Return the hand model of this store. Raises MissingResource if it is MANO and was not passed."""
         if self.hands is None:
             embedded = load_embedded_hands()
             if self.info.get("hand_model", {}).get("digest") != embedded.digest:
@@ -220,7 +228,7 @@ class Store:
         return self.hands
 
     def object_model(self, name: str) -> ObjectModel:
-        """The canonical mesh of an object of this store, by its key in ``objects``."""
+        """Return the canonical mesh of an object by its key in ``objects``."""
         if name not in self._models:
             match = self.objects.loc[self.objects["object"] == name]
             if match.empty:
@@ -233,7 +241,7 @@ class Store:
             self._models[name] = ObjectModel(name, hinge=hinge, **arrays)
         return self._models[name]
 
-    def _row(self, clip_id: str) -> dict[str, Any]:
+    def _facts(self, clip_id: str) -> dict[str, Any]:
         if not self._rows:
             self._rows = clip_rows(self.sequences)
         if clip_id not in self._rows:
@@ -250,16 +258,16 @@ class Store:
             self._arrays[name] = map_npz(self.folder / "arrays" / f"{name}.npz")
         return self._arrays[name]
 
-    def _hand(self, row: dict[str, Any], side: Side) -> HandTrack:
-        wrist_m, global_orient, hand_pose, betas, valid = self._frames(row["shard"]).hands[side]
-        frames, (betas_rows, template) = row["frames"], row["hands"][side]
+    def _hand(self, facts: dict[str, Any], side: Side) -> HandTrack:
+        wrist_m, global_orient, hand_pose, betas, valid = self._frames(facts["shard"]).hands[side]
+        frames, (betas_rows, template) = facts["frames"], facts["hands"][side]
         return HandTrack(
-            wrist_m[frames].copy(),
-            global_orient[frames].copy(),
-            hand_pose[frames].copy(),
-            betas[betas_rows].copy(),
-            valid[frames].copy(),
-            None if template is None else self._file("templates")[template].copy(),
+            wrist_m=wrist_m[frames].copy(),
+            global_orient=global_orient[frames].copy(),
+            hand_pose=hand_pose[frames].copy(),
+            betas=betas[betas_rows].copy(),
+            valid=valid[frames].copy(),
+            template_m=None if template is None else self._file("templates")[template].copy(),
         )
 
     def _object(self, name: str, pose: tuple[np.ndarray, ...], rows: slice) -> ObjectTrack:
@@ -268,42 +276,44 @@ class Store:
         hinge = hinge_rad[rows].copy() if model.is_articulated else None
         return ObjectTrack(model, rotvec[rows].copy(), translation_m[rows].copy(), hinge)
 
-    def _other_objects(self, row: dict[str, Any], shard: FrameShard) -> tuple[ObjectTrack, ...]:
-        first, length = row["other_row"], row["n_frames"]
-        starts = range(first, first + length * len(row["other_objects"]), length)
-        pairs = zip(row["other_objects"], starts, strict=True)
+    def _other_objects(self, facts: dict[str, Any], shard: FrameShard) -> tuple[ObjectTrack, ...]:
+        first, length = facts["other_row"], facts["n_frames"]
+        starts = range(first, first + length * len(facts["other_objects"]), length)
+        pairs = zip(facts["other_objects"], starts, strict=True)
         return tuple(self._object(name, shard.other, slice(start, start + length)) for name, start in pairs)
 
-    def _camera(self, row: dict[str, Any], shard: FrameShard) -> CameraTrack | None:
-        first, intrinsics = row["camera_row"], row["camera_intrinsics"]
+    def _camera(self, facts: dict[str, Any], shard: FrameShard) -> CameraTrack | None:
+        first, intrinsics = facts["camera_row"], facts["camera_intrinsics"]
         if first < 0:
             return None
-        rotvec, position_m, images = (array[first : first + row["n_frames"]].copy() for array in shard.camera)
+        rotvec, position_m, images = (array[first : first + facts["n_frames"]].copy() for array in shard.camera)
         intrinsics = None if intrinsics is None else np.array(intrinsics)
-        return CameraTrack(row["camera_name"], rotvec, position_m, images, intrinsics)
-
-    def _body(self, row: dict[str, Any]) -> BodyTrack | None:
-        if row["body_row"] < 0:
-            return None
-        shard = self._file(f"body-{row['shard']:05d}")
-        rows = slice(row["body_row"], row["body_row"] + row["n_frames"])
-        expressions = slice(row["expression_row"], row["expression_row"] + row["n_frames"])
-        return BodyTrack(
-            **{name: shard[name][rows].copy() for name in ("transl_m", "global_orient", "body_pose", "face_pose")},
-            expression=None if row["expression_row"] < 0 else shard["expression"][expressions].copy(),
+        return CameraTrack(
+            name=facts["camera_name"], rotvec=rotvec, position_m=position_m, images=images, intrinsics=intrinsics
         )
 
-    def _source_contact(self, row: dict[str, Any]) -> SourceContact | None:
-        first, count = row["source_contact_row"], row["source_contact_count"]
+    def _body(self, facts: dict[str, Any]) -> BodyTrack | None:
+        if facts["body_row"] < 0:
+            return None
+        shard = self._file(f"body-{facts['shard']:05d}")
+        rows = slice(facts["body_row"], facts["body_row"] + facts["n_frames"])
+        expressions = slice(facts["expression_row"], facts["expression_row"] + facts["n_frames"])
+        return BodyTrack(
+            **{name: shard[name][rows].copy() for name in ("transl_m", "global_orient", "body_pose", "face_pose")},
+            expression=None if facts["expression_row"] < 0 else shard["expression"][expressions].copy(),
+        )
+
+    def _source_contact(self, facts: dict[str, Any]) -> SourceContact | None:
+        first, count = facts["source_contact_row"], facts["source_contact_count"]
         if first < 0:
             return None
         if count == 0:
             return SourceContact(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.uint8))
-        shard = self._file(f"source_contact-{row['shard']:05d}")
+        shard = self._file(f"source_contact-{facts['shard']:05d}")
         return SourceContact(**{name: shard[name][first : first + count].copy() for name in shard})
 
-    def _sources_of(self, row: dict[str, Any]) -> tuple[SourceFile, ...]:
+    def _sources_of(self, facts: dict[str, Any]) -> tuple[SourceFile, ...]:
         if not self._sources and len(self.files):
             columns = (self.files[name].tolist() for name in ("path", "size", "sha256"))
             self._sources = [SourceFile(*values) for values in zip(*columns, strict=True)]
-        return tuple(self._sources[number] for number in row["source_files"])
+        return tuple(self._sources[number] for number in facts["source_files"])

@@ -1,4 +1,4 @@
-"""Writing a store: clips stream in, at most one shard of them is in memory, equal clips give equal bytes."""
+"""Writes a store from a stream of clips: at most one shard is in memory, and equal clips give equal bytes."""
 
 import shutil
 from collections import Counter
@@ -53,7 +53,7 @@ CONTACTS_PER_SHARD = 1 << 23  # 9 bytes each: GRAB's labels can be ten times the
 class ShardWriter:
     """Collects the rows of one shard of ``frames-*``, ``body-*`` and ``source_contact-*`` files.
 
-    At most one shard is in memory; a clip lies in one shard.
+    At most one shard is in memory. A clip is never divided between shards.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -66,14 +66,14 @@ class ShardWriter:
         self.lengths = {file.path: {field.name: 0 for field in file.fields} for file in _SHARDED}
 
     def append(self, file: StoreFile, name: str, array: np.ndarray) -> int:
-        """Add rows to one member, in its dtype; the row they start at."""
+        """Add rows to one member, in its dtype. Returns the number of the first added row."""
         pieces, lengths = self.pieces[file.path], self.lengths[file.path]
         pieces[name].append(np.array(array, pieces[name][0].dtype))
         lengths[name] += len(array)
         return lengths[name] - len(array)
 
     def append_all(self, file: StoreFile, arrays: dict[str, np.ndarray]) -> int:
-        """Add rows to several members that grow together; the row they start at."""
+        """Add equally many rows to several members. Returns the number of the first added row."""
         (first,) = {self.append(file, name, array) for name, array in arrays.items()}
         return first
 
@@ -87,7 +87,7 @@ class ShardWriter:
             self._flush()
 
     def finish(self) -> None:
-        """Write what is left; a store has at least one shard."""
+        """Write the last shard. A store has at least one shard."""
         if self.number == 0 or self.rows(FRAMES, "source_frames"):
             self._flush()
 
@@ -110,19 +110,19 @@ _DIGITS = 8
 class MeshWriter:
     """Collects the distinct meshes of a store by (name, digest); only their facts stay in memory.
 
-    The key of a mesh in the store is its name. Where several meshes share a name, all of them get the name followed by
-    ``#`` and the first 8 digits of their digest: which came first does not matter.
+    The key of a mesh in the store is its name. If several meshes share a name, each key is the name, ``#`` and the
+    first 8 digits of the digest, so that keys do not depend on the order of the clips.
     """
 
     def __init__(self, folder: Path) -> None:
-        self._aside = folder / "meshes.part"
+        self._temporary = folder / "meshes.part"
         self._facts: dict[MeshKey, dict[str, Any]] = {}
 
     def add(self, model: ObjectModel) -> MeshKey:
         arrays = mesh_arrays(model)
         key = model.name, mesh_digest(arrays, model)
         if key not in self._facts:
-            write_npz(self._aside / f"{len(self._facts)}.npz", arrays)
+            write_npz(self._temporary / f"{len(self._facts)}.npz", arrays)
             hinge = model.hinge
             self._facts[key] = {
                 "n_vertices": len(model.vertices_m),
@@ -135,29 +135,29 @@ class MeshWriter:
         return key
 
     def names(self) -> dict[MeshKey, str]:
-        """The final name of every mesh added so far."""
+        """Return the key in the store of each mesh added so far."""
         meshes_of = Counter(name for name, _ in self._facts)
         return {key: key[0] if meshes_of[key[0]] == 1 else f"{key[0]}#{key[1][:_DIGITS]}" for key in self._facts}
 
     def finish(self, path: Path) -> list[dict[str, Any]]:
-        """Write the arrays of all meshes to ``path``; the rows of objects.parquet."""
+        """Write the arrays of all meshes to ``path``. Returns the rows of objects.parquet."""
         names, members, rows = self.names(), {}, {}
         for number, (key, facts) in enumerate(self._facts.items()):
             name = names[key]
             rows[name] = {"object": name, **facts}
-            members |= {f"{name}/{kind}": array for kind, array in map_npz(self._aside / f"{number}.npz").items()}
+            members |= {f"{name}/{kind}": array for kind, array in map_npz(self._temporary / f"{number}.npz").items()}
         write_npz(path, dict(sorted(members.items())))
-        shutil.rmtree(self._aside, ignore_errors=True)
+        shutil.rmtree(self._temporary, ignore_errors=True)
         return [rows[name] for name in sorted(rows)]
 
 
 def mesh_arrays(model: ObjectModel) -> dict[str, np.ndarray]:
-    """vertices_m, faces and part in the dtypes of the store."""
+    """Return vertices_m, faces and part in the dtypes of the store."""
     return {f.name: np.ascontiguousarray(getattr(model, f.name), f.dtype) for f in OBJECT_ARRAYS.fields}
 
 
 def mesh_digest(arrays: dict[str, np.ndarray], model: ObjectModel) -> str:
-    """SHA-256 of vertices_m, faces, part and, where there is a hinge, its axis and origin (float64)."""
+    """Return the SHA-256 of vertices_m, faces, part and, for articulated objects, hinge axis and origin (float64)."""
     hinge = () if model.hinge is None else (model.hinge.axis, model.hinge.origin_m)
     ordered = [arrays[field.name] for field in OBJECT_ARRAYS.fields]
     return sha256_bytes(b"".join(array.tobytes() for array in (*ordered, *map(np.float64, hinge))))
@@ -168,10 +168,18 @@ def write_store(
 ) -> dict[str, int]:
     """Write clips, in the order given, as the store ``folder``; it appears whole or not at all.
 
-    info: the facts of ``hoidata.store.info.store_info``, and whatever else belongs into ``meta/info.json``.
-    A clip under an id that an earlier one has is left out: it becomes a row of the quarantine table.
-    Returns the counts: clips, frames, objects, files, quarantined. Raises BadInput for a clip that breaks the schema
-    and for an info that lacks a required fact.
+    A clip with the id of an earlier clip is quarantined.
+
+    Args:
+        folder: the store to write.
+        clips: clips, whole recordings and quarantined items.
+        info: the facts of ``hoidata.store.info.store_info``, and further keys for ``meta/info.json``.
+
+    Returns:
+        The counts: clips, frames, objects, files, quarantined.
+
+    Raises:
+        BadInput: a clip breaks the schema, or ``info`` lacks a required fact.
     """
     check_info(info)
     with atomic_folder(folder) as partial:
@@ -201,24 +209,24 @@ class _Writer:
 
     def add(self, clip: Clip) -> None:
         if clip.clip_id in self.rows:
-            self.quarantined.append(vars(_second_of_an_id(clip, self.rows[clip.clip_id])))
+            self.quarantined.append(vars(_repeated_id(clip, self.rows[clip.clip_id])))
             return
-        row = self._facts(clip)
-        row["first_row"] = self.shards.append(FRAMES, "source_frames", clip.source_frames)
+        facts = self._facts(clip)
+        facts["first_row"] = self.shards.append(FRAMES, "source_frames", clip.source_frames)
         for side in SIDES:
-            row |= self._add_hand(side, clip.hands[side])
+            facts |= self._add_hand(side, clip.hands[side])
         self._add_pose("object", clip.object)
-        row["other_row"] = self.shards.rows(FRAMES, "other_rotvec")
+        facts["other_row"] = self.shards.rows(FRAMES, "other_rotvec")
         for track in clip.other_objects:
             self._add_pose("other", track)
-        row |= self._add_camera(clip.camera) | self._add_body(clip.body) | self._add_contact(clip.source_contact)
-        self.rows[clip.clip_id] = row
+        facts |= self._add_camera(clip.camera) | self._add_body(clip.body) | self._add_contact(clip.source_contact)
+        self.rows[clip.clip_id] = facts
         self.shards.end_clip()
 
     def _facts(self, clip: Clip) -> dict[str, Any]:
         names = ("clip_id", "dataset", "subject", "sequence", "verb", "object_words", "labelled_hand", "n_frames")
-        further = ("source_fps", "synthetic", "gravity_note", "hands_from", "fit_error_m")
-        return {name: getattr(clip, name) for name in (*names, *further)} | {
+        optional = ("source_fps", "synthetic", "gravity_note", "hands_from", "fit_error_m")
+        return {name: getattr(clip, name) for name in (*names, *optional)} | {
             "shard": self.shards.number,
             "object": self.meshes.add(clip.object.model),
             "other_objects": [self.meshes.add(track.model) for track in clip.other_objects],
@@ -274,10 +282,10 @@ class _Writer:
         if track is None:
             return {"body_row": -1, "expression_row": -1}
         names = ("transl_m", "global_orient", "body_pose", "face_pose")
-        given = track.expression
+        expression = track.expression
         return {
             "body_row": self.shards.append_all(BODY, {name: getattr(track, name) for name in names}),
-            "expression_row": -1 if given is None else self.shards.append(BODY, "expression", given),
+            "expression_row": -1 if expression is None else self.shards.append(BODY, "expression", expression),
         }
 
     def _add_contact(self, contact: SourceContact | None) -> dict[str, Any]:
@@ -291,8 +299,8 @@ class _Writer:
     def finish(self, info: dict[str, Any]) -> dict[str, int]:
         self.shards.finish()
         names = self.meshes.names()
-        for row in self.rows.values():
-            row |= {"object": names[row["object"]], "other_objects": [names[key] for key in row["other_objects"]]}
+        for clip in self.rows.values():
+            clip |= {"object": names[clip["object"]], "other_objects": [names[key] for key in clip["other_objects"]]}
         rows = list(self.rows.values())
         objects = self.meshes.finish(self.folder / "arrays" / "objects.npz")
         write_npz(self.folder / "arrays" / "templates.npz", dict(sorted(self.templates.items())))
@@ -302,37 +310,38 @@ class _Writer:
             write_table(self.folder / TABLES[name].path, table, arrow_schema(TABLES[name]))
         counts = {
             "clips": len(rows),
-            "frames": sum(row["n_frames"] for row in rows),
+            "frames": sum(clip["n_frames"] for clip in rows),
             "objects": len(objects),
             "files": len(files),
             "quarantined": len(self.quarantined),
         }
-        found = self._write_recordings(names)
-        own = {"schema_version": SCHEMA_VERSION, "fps": FPS, "units": UNITS, "axes": AXES, "counts": counts}
+        recordings = self._write_recordings(names)
+        written = {"schema_version": SCHEMA_VERSION, "fps": FPS, "units": UNITS, "axes": AXES, "counts": counts}
         text = orjson.dumps(
-            orjson.loads(canonical_json(info | own | found)), option=orjson.OPT_INDENT_2 | orjson.OPT_SORT_KEYS
+            orjson.loads(canonical_json(info | written | recordings)), option=orjson.OPT_INDENT_2 | orjson.OPT_SORT_KEYS
         )
         (self.folder / "meta" / "info.json").write_bytes(text + b"\n")
         return counts
 
     def _write_recordings(self, object_names: dict[MeshKey, str]) -> dict[str, Any]:
-        """What info.json says of recordings; nothing in a store without any."""
-        own = self.recordings
-        if not own.facts:
+        """Write the recordings, if any. Returns their entries for info.json."""
+        recordings = self.recordings
+        if not recordings.facts:
             return {}
-        write_npz(self.folder / RECORDINGS.path, dict(sorted(own.arrays.items())))
-        write_npz(self.folder / SOURCE_HANDS.path, dict(sorted(own.hands.items())))
-        facts = {name: {**fact, "object": object_names[fact["object"]]} for name, fact in own.facts.items()}
-        return {"recordings": facts, "source_hands": own.hand_facts}
+        write_npz(self.folder / RECORDINGS.path, dict(sorted(recordings.arrays.items())))
+        write_npz(self.folder / SOURCE_HANDS.path, dict(sorted(recordings.hands.items())))
+        facts = {name: {**fact, "object": object_names[fact["object"]]} for name, fact in recordings.facts.items()}
+        return {"recordings": facts, "source_hands": recordings.hand_facts}
 
 
 def template_key(template_m: np.ndarray) -> str:
-    """The name of a personal rest mesh (778, 3) float32 in templates.npz."""
+    """Return the name in templates.npz of a personal rest mesh (778, 3) float32."""
     return sha256_bytes(np.ascontiguousarray(template_m).tobytes())[:16]
 
 
-def _second_of_an_id(clip: Clip, first: dict[str, Any]) -> Quarantined:
+def _repeated_id(clip: Clip, first: dict[str, Any]) -> Quarantined:
     frames = f"{first['first_source_frame']} to {first['last_source_frame']} of {first['sequence']}"
     got = f"a second one, frames {clip.source_frames[0]} to {clip.source_frames[-1]} of {clip.sequence}"
     remedy = "the first was kept; rename the sequence, or report it as a defect of the adapter"
-    return Quarantined(clip.clip_id, "clip_id", f"one clip of this id (frames {frames})", got, remedy)
+    expected = f"one clip of this id (frames {frames})"
+    return Quarantined(source_key=clip.clip_id, where="clip_id", expected=expected, got=got, remedy=remedy)

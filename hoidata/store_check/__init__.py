@@ -1,1 +1,1 @@
-"""Whether a store keeps what its field table says; the field table as a README."""
+"""Checks a store against its schema (``store/fields.py``), and generates the schema page."""

@@ -1,4 +1,4 @@
-"""The array files of a store against the field table and against the rows that point into them."""
+"""Checks the array files of a store against the schema and against the table rows that refer to them."""
 
 from collections.abc import Callable, Iterable, Iterator
 from operator import itemgetter
@@ -30,19 +30,16 @@ from hoidata.store.writing import mesh_digest, template_key
 from hoidata.store_check.tables import REMEDY, Columns
 
 Arrays = dict[str, np.ndarray]
-_STEP = 1 << 20  # rows whose finiteness is looked at in one go
+_STEP = 1 << 20  # rows that are checked for NaN in one call
 
 
 class _Range(NamedTuple):
-    """Rows of a member that belong to a clip: from the number in ``column``, as many as ``count`` (of the clip's row).
-
-    A column that may be -1 says that the clip has none.
-    """
+    """Which rows of an array member belong to a clip."""
 
     file: StoreFile
     member: str
-    column: str
-    count: Callable[[dict[str, Any]], int]
+    column: str  # column of ``sequences`` with the first row, -1 for a clip without rows
+    count: Callable[[dict[str, Any]], int]  # number of rows, from the clip's row of ``sequences``
 
 
 _RANGES = (
@@ -58,26 +55,27 @@ _RANGES = (
 
 
 def read_shards(folder: Path, file: StoreFile, paths: Iterable[str]) -> tuple[dict[int, Arrays], list[BadInput]]:
-    """The shards of one kind whose members are as documented, by number; and what is wrong with the others.
+    """Read the shards of one kind. Returns the valid shards by number, and the problems of the others.
 
-    paths: of all files the store has.
+    paths: paths of all files of the store.
     """
     start, end = file.path.split("*")
     shards, problems = {}, []
     for path in sorted(path for path in paths if path.startswith(start)):
-        arrays, found = read_members(folder, path, {field.name: field for field in file.fields})
-        problems += found
+        arrays, member_problems = read_members(folder, path, {field.name: field for field in file.fields})
+        problems += member_problems
         if arrays is not None:
-            found = list(_equal_lengths(path, file.fields, arrays))
-            problems += found
-            if not found:
+            length_problems = list(_equal_lengths(path, file.fields, arrays))
+            problems += length_problems
+            if not length_problems:
                 shards[int(path.removeprefix(start).removesuffix(end))] = arrays
     return shards, problems
 
 
 def read_members(folder: Path, path: str, fields: dict[str, Field]) -> tuple[Arrays | None, list[BadInput]]:
+    """Read the members ``fields`` of an array file. Returns None for the arrays if one is invalid."""
     if not (folder / path).is_file():
-        return None, []  # listed with the missing files
+        return None, []  # reported with the missing files
     try:
         arrays = map_npz(folder / path)
     except BadInput as error:
@@ -93,24 +91,24 @@ def read_members(folder: Path, path: str, fields: dict[str, Field]) -> tuple[Arr
     return (None if problems else arrays), problems
 
 
-def _member_problems(where: str, field: Field, array: np.ndarray) -> Iterator[BadInput]:
-    own = (*array.shape, *[0] * (len(field.shape) - array.ndim))
-    shape = tuple(n if isinstance(n, int) else m for n, m in zip(field.shape, own, strict=False))
+def _member_problems(member: str, field: Field, array: np.ndarray) -> Iterator[BadInput]:
+    lengths = (*array.shape, *[0] * (len(field.shape) - array.ndim))
+    shape = tuple(n if isinstance(n, int) else m for n, m in zip(field.shape, lengths, strict=False))
     if array.dtype != np.dtype(field.dtype):
-        yield BadInput(where, field.dtype, f"{array.dtype}", REMEDY)
+        yield BadInput(member, field.dtype, f"{array.dtype}", REMEDY)
     elif array.shape != shape:
         text = " x ".join(str(length) for length in field.shape)
-        yield BadInput(where, f"shape {text}", f"{array.shape}", REMEDY)
+        yield BadInput(member, f"shape {text}", f"{array.shape}", REMEDY)
     elif array.dtype.kind == "f":
         wrong = sum(int((~np.isfinite(array[at : at + _STEP])).sum()) for at in range(0, len(array), _STEP))
         if wrong:
-            yield BadInput(where, "finite numbers", f"{wrong} that are NaN or infinite", REMEDY)
+            yield BadInput(member, "finite numbers", f"{wrong} that are NaN or infinite", REMEDY)
     elif array.dtype == bool and array.view(np.uint8).max(initial=0) > 1:
-        yield BadInput(where, "bytes 0 and 1", f"{array.view(np.uint8).max()}", REMEDY)
+        yield BadInput(member, "bytes 0 and 1", f"{array.view(np.uint8).max()}", REMEDY)
 
 
 def _equal_lengths(path: str, fields: Iterable[Field], arrays: Arrays) -> Iterator[BadInput]:
-    """Members that count the same rows must have equally many."""
+    """Check that members with the same first axis have equally many rows."""
     lengths: dict[Any, tuple[str, int]] = {}
     for field in fields:
         name, length = lengths.setdefault(field.shape[0], (field.name, len(arrays[field.name])))
@@ -120,129 +118,133 @@ def _equal_lengths(path: str, fields: Iterable[Field], arrays: Arrays) -> Iterat
 
 
 def shard_problems(file: StoreFile, shards: dict[int, Arrays], sequences: Columns) -> Iterator[BadInput]:
-    """Rows that point outside, overlap, or leave some of a shard to nobody; and rows that say otherwise than arrays."""
+    """Check that the clips cover each shard exactly, and that their table rows agree with the arrays."""
     for number, arrays in shards.items():
-        clips = [row for row in _rows(sequences) if row["shard"] == number]
-        found = [
+        clips = [clip for clip in _rows(sequences) if clip["shard"] == number]
+        range_problems = [
             problem
             for kind in _RANGES
             if kind.file is file
             for problem in _range_problems(kind, number, clips, len(arrays[kind.member]))
         ]
-        yield from found
-        if file is FRAMES and not found:
+        yield from range_problems
+        if file is FRAMES and not range_problems:
             yield from _frame_problems(clips, arrays)
 
 
 def _range_problems(kind: _Range, number: int, clips: list[dict[str, Any]], length: int) -> Iterator[BadInput]:
-    """The clips of a shard must fill it one after another, in their order."""
-    at, path = 0, kind.file.path.replace("*", f"{number:05d}")
-    for row in clips:
-        if row[kind.column] == -1:
+    """Check that the clips of a shard fill it one after another, in their order."""
+    start, path = 0, kind.file.path.replace("*", f"{number:05d}")
+    for clip in clips:
+        if clip[kind.column] == -1:
             continue
-        if row[kind.column] != at:
-            where = f"{SEQUENCES.path}: {kind.column} of {row['clip_id']}"
-            yield BadInput(where, f"{at}, where the clip before it ends in {path}", f"{row[kind.column]}", REMEDY)
+        if clip[kind.column] != start:
+            column = f"{SEQUENCES.path}: {kind.column} of {clip['clip_id']}"
+            yield BadInput(column, f"{start}, where the clip before it ends in {path}", f"{clip[kind.column]}", REMEDY)
             return
-        at += kind.count(row)
-    if at != length:
-        yield BadInput(f"{path}: {kind.member}", f"{at} rows for the clips of {SEQUENCES.path}", f"{length}", REMEDY)
+        start += kind.count(clip)
+    if start != length:
+        yield BadInput(f"{path}: {kind.member}", f"{start} rows for the clips of {SEQUENCES.path}", f"{length}", REMEDY)
 
 
 def _frame_problems(clips: list[dict[str, Any]], arrays: Arrays) -> Iterator[BadInput]:
-    for row in clips:
-        where = f"{SEQUENCES.path}: {{}} of {row['clip_id']}"
-        frames = slice(row["first_row"], row["first_row"] + row["n_frames"])
+    for clip in clips:
+        frames = slice(clip["first_row"], clip["first_row"] + clip["n_frames"])
         source = arrays["source_frames"][frames]
-        if not frame_numbers_rise(source, row["source_fps"]):
-            yield BadInput(f"{FRAMES.path}: source_frames of {row['clip_id']}", "rising numbers", "others", REMEDY)
-        found = {
+        if not frame_numbers_rise(source, clip["source_fps"]):
+            yield BadInput(f"{FRAMES.path}: source_frames of {clip['clip_id']}", "rising numbers", "others", REMEDY)
+        from_arrays = {
             "first_source_frame": int(source[0]),
             "last_source_frame": int(source[-1]),
             **{f"{side}_valid_frames": int(arrays[f"{side}_valid"][frames].sum()) for side in SIDES},
         }
-        for name, value in found.items():
-            if row[name] != value:
-                yield BadInput(where.format(name), f"{value} as in its shard", f"{row[name]}", REMEDY)
-        if not row["articulated"] and arrays["object_hinge_rad"][frames].any():
-            where = f"{FRAMES.path}: object_hinge_rad of {row['clip_id']}"
-            yield BadInput(where, "0 for a rigid object", "other angles", REMEDY)
+        for name, value in from_arrays.items():
+            if clip[name] != value:
+                yield BadInput(
+                    f"{SEQUENCES.path}: {name} of {clip['clip_id']}",
+                    f"{value} as in its shard",
+                    f"{clip[name]}",
+                    REMEDY,
+                )
+        if not clip["articulated"] and arrays["object_hinge_rad"][frames].any():
+            member = f"{FRAMES.path}: object_hinge_rad of {clip['clip_id']}"
+            yield BadInput(member, "0 for a rigid object", "other angles", REMEDY)
 
 
 def mesh_problems(folder: Path, objects: Columns) -> Iterator[BadInput]:
-    """objects.npz against the rows that name its members."""
+    """Check objects.npz against the rows of the objects table."""
     fields = {f"{name}/{field.name}": field for name in objects["object"] for field in OBJECT_ARRAYS.fields}
-    arrays, found = read_members(folder, OBJECT_ARRAYS.path, fields)
-    yield from found
+    arrays, problems = read_members(folder, OBJECT_ARRAYS.path, fields)
+    yield from problems
     if arrays is not None:
-        for row in _rows(objects):
-            yield from _mesh_problems(row, arrays)
+        for facts in _rows(objects):
+            yield from _mesh_problems(facts, arrays)
 
 
 def template_problems(folder: Path, sequences: Columns) -> Iterator[BadInput]:
-    """templates.npz against the rows that name its members."""
+    """Check templates.npz against the rows of the sequences table."""
     names = {name for side in SIDES for name in sequences[f"{side}_template"] if name is not None}
-    arrays, found = read_members(folder, TEMPLATES.path, {name: TEMPLATES.fields[0] for name in sorted(names)})
-    yield from found
+    arrays, problems = read_members(folder, TEMPLATES.path, {name: TEMPLATES.fields[0] for name in sorted(names)})
+    yield from problems
     for name, template_m in (arrays or {}).items():
         if template_key(template_m) != name:
-            where = f"{TEMPLATES.path}: {name}"
-            yield BadInput(where, "a name that is the start of its SHA-256", template_key(template_m), REMEDY)
+            expected = "a name that is the start of its SHA-256"
+            yield BadInput(f"{TEMPLATES.path}: {name}", expected, template_key(template_m), REMEDY)
 
 
 def _rows(columns: Columns) -> list[dict[str, Any]]:
     return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
 
-def _mesh_problems(row: dict[str, Any], arrays: Arrays) -> Iterator[BadInput]:
-    name = row["object"]
+def _mesh_problems(facts: dict[str, Any], arrays: Arrays) -> Iterator[BadInput]:
+    name = facts["object"]
     mesh = {field.name: np.array(arrays[f"{name}/{field.name}"]) for field in OBJECT_ARRAYS.fields}
-    where = f"{OBJECT_ARRAYS.path}: {name}"
+    path = f"{OBJECT_ARRAYS.path}: {name}"
     for column, member in (("n_vertices", "vertices_m"), ("n_faces", "faces"), ("n_vertices", "part")):
-        if row[column] != len(mesh[member]):
-            expected = f"{row[column]} rows as in {OBJECTS.path}"
-            yield BadInput(f"{where}/{member}", expected, f"{len(mesh[member])}", REMEDY)
+        if facts[column] != len(mesh[member]):
+            expected = f"{facts[column]} rows as in {OBJECTS.path}"
+            yield BadInput(f"{path}/{member}", expected, f"{len(mesh[member])}", REMEDY)
     faces = mesh["faces"]
     if not faces.size or faces.min() < 0 or faces.max() >= len(mesh["vertices_m"]):
         expected = f"triangles of vertices 0 to {len(mesh['vertices_m']) - 1}"
-        yield BadInput(f"{where}/faces", expected, "none" if not faces.size else "other numbers", REMEDY)
+        yield BadInput(f"{path}/faces", expected, "none" if not faces.size else "other numbers", REMEDY)
     if mesh["part"].max(initial=0) > 1:
-        yield BadInput(f"{where}/part", "0 and 1", f"{mesh['part'].max()}", REMEDY)
+        yield BadInput(f"{path}/part", "0 and 1", f"{mesh['part'].max()}", REMEDY)
     hinge = None
-    if row["hinge_axis"] is not None and row["hinge_origin_m"] is not None:
-        hinge = Hinge(np.array(row["hinge_axis"]), np.array(row["hinge_origin_m"]))
+    if facts["hinge_axis"] is not None and facts["hinge_origin_m"] is not None:
+        hinge = Hinge(np.array(facts["hinge_axis"]), np.array(facts["hinge_origin_m"]))
     digest = mesh_digest(mesh, ObjectModel(name, hinge=hinge, **mesh))
-    if digest != row["digest"]:
-        yield BadInput(f"{OBJECTS.path}: digest of {name}", f"{digest} as its mesh says", f"{row['digest']}", REMEDY)
+    if digest != facts["digest"]:
+        yield BadInput(f"{OBJECTS.path}: digest of {name}", f"{digest} as its mesh says", f"{facts['digest']}", REMEDY)
 
 
 _RECORDING_FACTS = ("subject", "fps", "frames", "object", "hand", "gravity", "source_files")
 
 
 def recording_problems(folder: Path, info: dict[str, Any], objects: set[str], n_files: int) -> Iterator[BadInput]:
-    """What is wrong with the recordings; nothing in a store without any. objects: keys of meshes; n_files: rows."""
+    """Check the whole recordings, if the store has any. objects: keys of meshes; n_files: rows of the files table."""
     recordings, hands = info.get("recordings", {}), info.get("source_hands", {})
     if not isinstance(recordings, dict) or not isinstance(hands, dict):
         yield BadInput(f"{INFO.path}: recordings", "facts by sequence, and of hands", "something else", REMEDY)
         return
-    sound = True
+    is_valid = True
     for name, facts in recordings.items():
         for problem in _recording_facts(f"{INFO.path}: recordings.{name}", facts, objects, set(hands), n_files):
-            sound = False
+            is_valid = False
             yield problem
-    if recordings and sound:
+    if recordings and is_valid:
         yield from _recorded_arrays(folder, recordings, hands)
 
 
-def _recording_facts(where: str, facts: Any, objects: set[str], hands: set[str], n_files: int) -> Iterator[BadInput]:
+def _recording_facts(source: str, facts: Any, objects: set[str], hands: set[str], n_files: int) -> Iterator[BadInput]:
     if not isinstance(facts, dict) or set(_RECORDING_FACTS) - set(facts):
-        yield BadInput(where, f"an object with {', '.join(_RECORDING_FACTS)}", repr(facts)[:80], REMEDY)
+        yield BadInput(source, f"an object with {', '.join(_RECORDING_FACTS)}", repr(facts)[:80], REMEDY)
         return
-    for key, known in (("object", objects), ("hand", hands)):
-        if facts[key] not in known:
-            yield BadInput(f"{where}.{key}", "one the store has", f"{facts[key]}", REMEDY)
+    for key, valid_keys in (("object", objects), ("hand", hands)):
+        if facts[key] not in valid_keys:
+            yield BadInput(f"{source}.{key}", "a key in the store", f"{facts[key]}", REMEDY)
     if not all(isinstance(number, int) and 0 <= number < n_files for number in facts["source_files"]):
-        yield BadInput(f"{where}.source_files", f"rows 0 to {n_files - 1}", f"{facts['source_files']}", REMEDY)
+        yield BadInput(f"{source}.source_files", f"rows 0 to {n_files - 1}", f"{facts['source_files']}", REMEDY)
 
 
 def _recorded_arrays(folder: Path, recordings: dict[str, Any], hands: dict[str, Any]) -> Iterator[BadInput]:
@@ -257,7 +259,7 @@ def _recorded_arrays(folder: Path, recordings: dict[str, Any], hands: dict[str, 
             name = member.removesuffix(f"/{field.name}")
             lengths: dict[int | str, int] = {"frame": recordings[name]["frames"]} if file is RECORDINGS else {}
             lengths["joint"] = counts[recordings[name]["hand"] if file is RECORDINGS else name]
-            wanted = tuple(lengths.get(axis, axis) for axis in field.shape)
-            got = arrays[member].shape
-            if any(isinstance(n, int) and n != m for n, m in zip(wanted, got, strict=True)):
-                yield BadInput(f"{file.path}: {member}", f"shape {wanted}", f"{got}", REMEDY)
+            expected = tuple(lengths.get(axis, axis) for axis in field.shape)
+            shape = arrays[member].shape
+            if any(isinstance(n, int) and n != m for n, m in zip(expected, shape, strict=True)):
+                yield BadInput(f"{file.path}: {member}", f"shape {expected}", f"{shape}", REMEDY)

@@ -23,13 +23,13 @@ from `fields.py`, which the writer and the checker use.
 The clips of a shard are stored in the order of `sequences.parquet`, without gaps. A clip's frames are the rows
 `first_row` to `first_row + n_frames` of every per-frame array. Betas start at `<side>_betas_row` and have
 `<side>_betas_count` rows: 1, or one per frame. Further object k starts at `other_row + k * n_frames`. Camera, body
-and expression start at their own `*_row`; contact labels have `source_contact_count` rows.
+and expression start at their `*_row`; contact labels have `source_contact_count` rows.
 
 ## Ids and order
 - `clip_id` consists of the source's names and frame numbers. A partial copy of a dataset gives the same ids, arrays
-  and rows for the clips it   has, except `shard`, `*_row` and `source_files`.
+  and rows for the clips it has, except `shard`, `*_row` and `source_files`.
 - A second clip with the same id is quarantined. Sequences are written in key order, whatever the number of processes.
-- An object's key is its name. If meshes of one name differ, all of them are called `<name>#<first 8 digits of
+- An object's key is its name. If meshes of one name differ, each is called `<name>#<first 8 digits of
   digest>`.
 
 A store of another schema version is refused: convert its raw files again.
@@ -47,12 +47,12 @@ def readme() -> str:
 def _section(file: StoreFile) -> str:
     lines = [f"## `{file.path}`", f"{file.meaning[0].upper()}{file.meaning[1:]}. Order: {file.order}.", ""]
     lines += ["| name | type | unit, frame | meaning |", "|---|---|---|---|"]
-    both = {
+    paired = {
         field.name.replace("right_", "<side>_", 1): field for field in file.fields if field.name.startswith("right_")
     }
     for field in file.fields:
         name = field.name.replace("left_", "<side>_", 1)
-        if name in both:
+        if name in paired:
             lines.append(_row(replace(field, name=name, meaning=field.meaning.replace("left", "<side>"))))
         elif not field.name.startswith("right_"):
             lines.append(_row(field))
@@ -63,8 +63,8 @@ def _row(field: Field) -> str:
     shape = f" ({', '.join(str(length) for length in field.shape)})" if field.shape else ""
     choices = f" ({', '.join(field.choices)})" if field.choices else ""
     null = "" if field.required else "; may be null"
-    place = ", ".join(filter(None, (field.unit, field.frame)))
-    return f"| `{field.name}` | {field.dtype}{shape} | {place} | {field.meaning}{choices}{null} |"
+    unit_and_frame = ", ".join(filter(None, (field.unit, field.frame)))
+    return f"| `{field.name}` | {field.dtype}{shape} | {unit_and_frame} | {field.meaning}{choices}{null} |"
 
 
 if __name__ == "__main__":

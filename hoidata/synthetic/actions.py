@@ -1,59 +1,62 @@
-"""What happens in the embedded corpora: which verb with which object, held how, and how long it takes.
+"""The actions of the embedded corpora: verb, object, grasp and length.
 
-Only pairs that the real label tables have. Each pair has one hand type and one grasped region, so that the sentence
-tells both; verbs and objects are crossed, so that the object alone does not.
+All pairs of verb and object occur in the real label tables. Each pair has one hand type and one grasped region, so that
+the sentence determines both. Objects have several verbs, so that the object alone does not.
 """
 
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-from hoidata.synthetic.grasps import Hold, Reach
+from hoidata.synthetic.grasps import Approach, GraspSpec
 from hoidata.synthetic.paths import MOTIONS, Motion
 
 
 @dataclass(frozen=True)
 class Action:
-    """verb: in words. intent: as in the source's files. object_name: as in the source. motion: key of MOTIONS."""
+    """A verb with an object, the grasp and the motion."""
 
     verb: str
-    object_name: str
-    hold: Hold
-    motion_name: str = ""
-    intent: str = ""
+    object_name: str  # as in the source
+    grasp: GraspSpec
+    motion_name: str = ""  # key of MOTIONS; by default the verb
+    intent: str = ""  # as in the files of GRAB
 
     @property
     def motion(self) -> Motion:
         return MOTIONS[self.motion_name or self.verb]
 
 
-RIGHT = Hold((("right", Reach((0.75, -0.35, 0.45))),))
-LEFT = Hold((("left", Reach((-0.75, -0.35, 0.45))),))
-SIDES = Hold(
-    (("left", Reach((-1, -0.1, 0.1), 0.22, blend=(0, 0.6))), ("right", Reach((1, -0.1, 0.1), 0.22, blend=(0, 0.6))))
+RIGHT = GraspSpec((("right", Approach((0.75, -0.35, 0.45))),))
+LEFT = GraspSpec((("left", Approach((-0.75, -0.35, 0.45))),))
+SIDES = GraspSpec(
+    (
+        ("left", Approach((-1, -0.1, 0.1), 0.22, blend=(0, 0.6))),
+        ("right", Approach((1, -0.1, 0.1), 0.22, blend=(0, 0.6))),
+    )
 )
 
 
-def _body_and_lid(body_m: tuple[float, float, float], lid_m: tuple[float, float, float]) -> Hold:
-    """Left hand round the body, right hand on the lid of a rigid container."""
-    left = Reach((-1, -0.2, 0.1), 0.3, body_m, (0, 0.6))
-    return Hold((("left", left), ("right", Reach((0.7, -0.2, 0.7), 0.35, lid_m, (0, 0.8)))))
+def _body_and_lid(body_m: tuple[float, float, float], lid_m: tuple[float, float, float]) -> GraspSpec:
+    """Left hand around the body, right hand on the lid of a rigid container."""
+    left = Approach((-1, -0.2, 0.1), 0.3, body_m, (0, 0.6))
+    return GraspSpec((("left", left), ("right", Approach((0.7, -0.2, 0.7), 0.35, lid_m, (0, 0.8)))))
 
 
-def _base_and_lid(angles_rad: tuple[float, ...]) -> Hold:
-    """Left hand on the base, right hand on the part the hinge moves; the first angle is where they arrive."""
-    base = Reach((-1, -0.3, 0.0), 0.45, blend=(0, 0.8), part=0)
-    return Hold(
-        (("left", base), ("right", Reach((1, -0.4, 0.4), 0.45, blend=(0, 0.8), part=1))), angles_rad[0], angles_rad
+def _base_and_lid(angles_rad: tuple[float, ...]) -> GraspSpec:
+    """Left hand on the base, right hand on the lid; the hands arrive at the first hinge angle."""
+    base = Approach((-1, -0.3, 0.0), 0.45, blend=(0, 0.8), part=0)
+    return GraspSpec(
+        (("left", base), ("right", Approach((1, -0.4, 0.4), 0.45, blend=(0, 0.8), part=1))), angles_rad[0], angles_rad
     )
 
 
 OPENING = _base_and_lid((0.4, 0.62, 0.85))
 CLOSING = _base_and_lid((0.85, 0.62, 0.4))
-MUG_HANDLE = Hold((("right", Reach((1, -0.35, 0.2), 0.35, (0.079, 0, 0.045), (0.0, 0.9))),))
-TEAPOT_HANDLE = Hold((("right", Reach((0.5, -0.4, 0.9), 0.3, (0.125, 0, 0.08), (0, 0.8))),))
-HAMMER_HANDLE = Hold((("right", Reach((0.3, -0.4, 0.9), 0.3, (0.05, 0, 0.02), (0, 0.8))),))
-STEM_LEFT = Hold((("left", Reach((-1, -0.35, 0.2), 0.3, (0, 0, 0.13))),))
-STEM_RIGHT = Hold((("right", Reach((1, -0.35, 0.2), 0.3, (0, 0, 0.13))),))
+MUG_HANDLE = GraspSpec((("right", Approach((1, -0.35, 0.2), 0.35, (0.079, 0, 0.045), (0.0, 0.9))),))
+TEAPOT_HANDLE = GraspSpec((("right", Approach((0.5, -0.4, 0.9), 0.3, (0.125, 0, 0.08), (0, 0.8))),))
+HAMMER_HANDLE = GraspSpec((("right", Approach((0.3, -0.4, 0.9), 0.3, (0.05, 0, 0.02), (0, 0.8))),))
+STEM_LEFT = GraspSpec((("left", Approach((-1, -0.35, 0.2), 0.3, (0, 0, 0.13))),))
+STEM_RIGHT = GraspSpec((("right", Approach((1, -0.35, 0.2), 0.3, (0, 0, 0.13))),))
 
 H2O_ACTIONS = (
     Action("grab", "espresso", RIGHT),
@@ -162,15 +165,15 @@ DATASET_IDS = {"h2o": 1, "grab": 2, "arctic": 3}
 
 
 class Entry(NamedTuple):
-    """subject; action: row of ACTIONS[dataset]; number: how many times this subject did it before, from 1."""
+    """One sequence of the plan."""
 
     subject: str
-    action: int
-    number: int
+    action: int  # index in ACTIONS[dataset]
+    number: int  # counts the repetitions by this subject from 1
 
 
 class Cast(NamedTuple):
-    """Subjects of the training, validation and test splits, and how many actions each split has."""
+    """Subjects of the training, validation and test splits, and the number of actions of each split."""
 
     train: tuple[str, ...]
     validation: tuple[str, ...]
@@ -201,7 +204,7 @@ def subjects(dataset: str, size: Size) -> tuple[str, ...]:
 
 
 def plan(dataset: str, size: Size) -> list[Entry]:
-    """All actions of a corpus, in order. Every action of validation and test also happens in training."""
+    """Plan all actions of a corpus. All actions of validation and test also occur in training."""
     cast = CASTS[dataset][size]
     n_actions = min(_ACTIONS_OF[size], len(ACTIONS[dataset]))
     if cast.counts[0] < n_actions:
@@ -209,7 +212,7 @@ def plan(dataset: str, size: Size) -> list[Entry]:
     entries: list[Entry] = []
     for split, (names, count) in enumerate(zip(cast[:3], cast.counts, strict=True)):
         for index in range(count):
-            # Another prime step per split, so that a short split does not always begin with the same actions.
+            # A different offset per split, so that short splits do not start with the same actions.
             action = (index + 5 * split) % n_actions
             subject = names[(index + index // n_actions) % len(names)]
             done = sum(entry.subject == subject and entry.action == action for entry in entries)

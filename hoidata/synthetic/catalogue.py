@@ -1,7 +1,7 @@
-"""The objects of the embedded corpora: real names from H2O, GRAB and ARCTIC, shapes of our own.
+"""The objects of the embedded corpora: names of H2O, GRAB and ARCTIC, and synthetic shapes.
 
-Shapes are drawn upright (z up, metres). ``standing_deg`` turns the mesh as it is filed to that position;
-ARCTIC files its objects with the hinge along (0, 0, -1) through the origin.
+Shapes are defined upright (z up, metres). ``standing_deg`` rotates the stored mesh to that orientation. ARCTIC's meshes
+are stored with the hinge along (0, 0, -1) through the origin.
 """
 
 from collections.abc import Callable
@@ -15,29 +15,25 @@ from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.synthetic.shapes import Solid, cylinder, revolved, rounded_box, sharp_box, sphere, torus, united
 
 ARCTIC_AXIS = np.array([0.0, 0.0, -1.0])
-# How an object with its hinge across, at the far side, stands (canonical x away from the person, y up, z to the right):
-# x-y-z Euler angles in degrees from the mesh as filed. An upright hinge, or none, needs no turn.
+# x-y-z Euler angles in degrees, from the stored mesh to the upright frame, of objects with a horizontal hinge at the
+# far side (canonical x away from the person, y up, z to the right). A vertical hinge, or none, needs no rotation.
 HINGE_BEHIND = (90.0, 0.0, 90.0)
 
 
 @dataclass(frozen=True)
 class ObjectSpec:
-    """How to make one object.
+    """How to build one object."""
 
-    name: as in the source's file names. words: as in sentences. stand_m: height of the slim stand it rests on, which
-    leaves room for the fingers below. base, lid: functions that make the solids, upright.
-    """
-
-    name: str
-    words: str
-    base: Callable[[], Solid]
+    name: str  # as in the file names of the source
+    words: str  # noun in sentences
+    base: Callable[[], Solid]  # builds the solid, upright
     lid: Callable[[], Solid] | None = None
-    stand_m: float = 0.0
-    standing_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    stand_m: float = 0.0  # height of the slim support, which leaves space for the fingers below the object
+    standing_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x-y-z Euler angles, stored mesh to upright
 
     @property
     def upright_from_object(self) -> np.ndarray:
-        """(3, 3) turns the mesh as filed to the upright frame."""
+        """(3, 3) rotation of the stored mesh to the upright frame."""
         return Rotation.from_euler("xyz", self.standing_deg, degrees=True).as_matrix()
 
 
@@ -63,7 +59,7 @@ def _milk() -> Solid:
 
 def _mug() -> Solid:
     cup = [(0, 0), (0.034, 0), (0.038, 0.004), (0.038, 0.095), (0.036, 0.097), (0.031, 0.095), (0.029, 0.08), (0, 0.08)]
-    # A hook handle, open below and wide enough for four fingers.
+    # A hook handle, open at the bottom and wide enough for four fingers.
     grip = rounded_box((0.022, 0.022, 0.085)).moved((0.079, 0, 0.05))
     arm = rounded_box((0.05, 0.018, 0.014)).moved((0.056, 0, 0.0853))
     return united(revolved(cup), united(grip, arm))
@@ -88,7 +84,7 @@ def _teapot() -> Solid:
 
 
 def tilted(degrees: float) -> np.ndarray:
-    """(3, 3) turn from upright to the person's right."""
+    """Return the (3, 3) rotation from upright to the person's right."""
     return Rotation.from_euler("y", degrees, degrees=True).as_matrix()
 
 
@@ -176,13 +172,15 @@ GRAB_OBJECTS = (
 def hinged(
     name: str, words: str, width: float, depth: float, base: float, lid: float, stand_m: float = 0.0
 ) -> ObjectSpec:
-    """Two slabs, hinged behind: width along the hinge, depth towards the person, heights of base and lid."""
+    """Two slabs with the hinge at the back: width along the hinge, depth towards the person, heights of both."""
     return ObjectSpec(
-        name, words,
-        box_at((width, depth, base), (0, -depth / 2, -base / 2 - 0.0005), 0.003, 0.014),
-        box_at((width, depth, lid), (0, -depth / 2, lid / 2 + 0.0005), 0.003, 0.014),
-        stand_m, HINGE_BEHIND,
-    )  # fmt: skip
+        name=name,
+        words=words,
+        base=box_at((width, depth, base), (0, -depth / 2, -base / 2 - 0.0005), 0.003, 0.014),
+        lid=box_at((width, depth, lid), (0, -depth / 2, lid / 2 + 0.0005), 0.003, 0.014),
+        stand_m=stand_m,
+        standing_deg=HINGE_BEHIND,
+    )
 
 
 ARCTIC_OBJECTS = (
@@ -191,46 +189,61 @@ ARCTIC_OBJECTS = (
     hinged("notebook", "notebook", 0.15, 0.2, 0.018, 0.016, 0.08),
     hinged("phone", "phone", 0.056, 0.09, 0.016, 0.012, 0.08),
     ObjectSpec(
-        "microwave", "microwave",
+        "microwave",
+        "microwave",
         box_at((0.2, 0.13, 0.13), (0.1, 0.0655, 0.065), 0.003, 0.013),
         box_at((0.2, 0.018, 0.13), (0.1, -0.0095, 0.065), 0.003, 0.013),
     ),
     ObjectSpec(
-        "ketchup", "ketchup",
-        _ketchup_bottle, lambda: cylinder(0.022, 0.03).moved((0, -0.024, 0.0155)),
-        0.0, HINGE_BEHIND,
+        name="ketchup",
+        words="ketchup",
+        base=_ketchup_bottle,
+        lid=lambda: cylinder(0.022, 0.03).moved((0, -0.024, 0.0155)),
+        stand_m=0.0,
+        standing_deg=HINGE_BEHIND,
     ),
     ObjectSpec(
-        "waffleiron", "waffle iron",
-        lambda: cylinder(0.085, 0.04).moved((0, -0.085, -0.0205)),
-        lambda: cylinder(0.085, 0.03).moved((0, -0.085, 0.0155)),
-        0.06, HINGE_BEHIND,
+        name="waffleiron",
+        words="waffle iron",
+        base=lambda: cylinder(0.085, 0.04).moved((0, -0.085, -0.0205)),
+        lid=lambda: cylinder(0.085, 0.03).moved((0, -0.085, 0.0155)),
+        stand_m=0.06,
+        standing_deg=HINGE_BEHIND,
     ),
-    ObjectSpec("mixer", "mixer", _mixer_base, box_at((0.06, 0.19, 0.06), (0, -0.095, 0.0305)), 0.0, HINGE_BEHIND),
     ObjectSpec(
-        "capsulemachine", "capsule machine",
-        box_at((0.1, 0.16, 0.16), (0, -0.08, -0.0805), 0.004, 0.015),
-        box_at((0.09, 0.15, 0.02), (0, -0.075, 0.0105)),
-        0.0, HINGE_BEHIND,
+        name="mixer",
+        words="mixer",
+        base=_mixer_base,
+        lid=box_at((0.06, 0.19, 0.06), (0, -0.095, 0.0305)),
+        stand_m=0.0,
+        standing_deg=HINGE_BEHIND,
     ),
-)  # fmt: skip
+    ObjectSpec(
+        name="capsulemachine",
+        words="capsule machine",
+        base=box_at((0.1, 0.16, 0.16), (0, -0.08, -0.0805), 0.004, 0.015),
+        lid=box_at((0.09, 0.15, 0.02), (0, -0.075, 0.0105)),
+        stand_m=0.0,
+        standing_deg=HINGE_BEHIND,
+    ),
+)
 
 OBJECTS = {"h2o": H2O_OBJECTS, "grab": GRAB_OBJECTS, "arctic": ARCTIC_OBJECTS}
 
 
 def object_spec(dataset: str, name: str) -> ObjectSpec:
-    """The spec of an object; KeyError for a name the dataset does not have."""
+    """Return the spec of an object. Raises KeyError for an unknown name."""
     return {spec.name: spec for spec in OBJECTS[dataset]}[name]
 
 
 def object_model(dataset: str, name: str) -> ObjectModel:
-    """A catalogue object in metres."""
+    """Build an object of the catalogue, metres."""
     return model_of(object_spec(dataset, name))
 
 
 @lru_cache(maxsize=64)
 def model_of(spec: ObjectSpec) -> ObjectModel:
-    """An object in metres, made once per process: base vertices first, then those the hinge moves."""
+    """Build an object, metres, once per process. Vertices of the base come first, then those of the lid."""
     base = spec.base()
     vertices, faces, part = [base.vertices_m], [base.faces], [np.zeros(len(base.vertices_m), dtype=np.uint8)]
     hinge = None
@@ -240,6 +253,12 @@ def model_of(spec: ObjectSpec) -> ObjectModel:
         faces.append(lid.faces + len(base.vertices_m))
         part.append(np.ones(len(lid.vertices_m), dtype=np.uint8))
         hinge = Hinge(ARCTIC_AXIS, np.zeros(3))
-    # Files keep float32-exact millimetres, so the truth and what a reader finds are the same numbers.
-    filed = np.concatenate(vertices) @ spec.upright_from_object
-    return ObjectModel(spec.name, np.round(filed, 7), np.concatenate(faces), np.concatenate(part), hinge)
+    # Rounded so that the files reproduce the ground truth exactly.
+    stored = np.concatenate(vertices) @ spec.upright_from_object
+    return ObjectModel(
+        name=spec.name,
+        vertices_m=np.round(stored, 7),
+        faces=np.concatenate(faces),
+        part=np.concatenate(part),
+        hinge=hinge,
+    )

@@ -1,4 +1,4 @@
-"""The figures of an embedded corpus: are its held frames physically possible, and would wrong ones be noticed?"""
+"""Physical plausibility of an embedded corpus, with negative controls: shifted hands, and no hands."""
 
 from typing import NamedTuple
 
@@ -17,11 +17,11 @@ SHIFT_M = 0.010
 _DIRECTIONS_SEED = 7
 
 
-class SequenceFigures(NamedTuple):
-    """Counts over the held frames of one sequence; distances in metres over its frames."""
+class SequenceMetrics(NamedTuple):
+    """Counts over the lifted frames of one sequence; distances in metres over its frames."""
 
     dataset: str
-    held: int
+    lifted: int
     feasible: int
     feasible_shifted: int
     feasible_without_contact: int
@@ -31,27 +31,34 @@ class SequenceFigures(NamedTuple):
     verb: str
 
 
-def sequence_figures(truth: TruthSequence) -> SequenceFigures:
-    """Figures of one sequence and of its two controls: hands moved by 10 mm, and no hands."""
+def sequence_metrics(truth: TruthSequence) -> SequenceMetrics:
+    """Measure one sequence and its two negative controls: hands shifted by 10 mm, and no hands."""
     pair = load_embedded_hands()
     sound = measure(truth, pair)
     residuals = (sound.residual, measure(truth, pair, _shift(truth)).residual, residuals_without_contact(truth))
     feasible, shifted, without = (int((residual < RESIDUAL_LIMIT).sum()) for residual in residuals)
-    return SequenceFigures(
-        truth.dataset, len(sound.residual), feasible, shifted, without, float(sound.distance_m.max(initial=0)),
-        float(sound.penetration_m.max()), len(truth.clip_frames), truth.verb,
-    )  # fmt: skip
+    return SequenceMetrics(
+        dataset=truth.dataset,
+        lifted=len(sound.residual),
+        feasible=feasible,
+        feasible_shifted=shifted,
+        feasible_without_contact=without,
+        largest_distance_m=float(sound.distance_m.max(initial=0)),
+        largest_penetration_m=float(sound.penetration_m.max()),
+        clip_frames=len(truth.clip_frames),
+        verb=truth.verb,
+    )
 
 
 def _shift(truth: TruthSequence) -> np.ndarray:
-    """10 mm in a direction that differs from sequence to sequence but not from run to run."""
+    """Return a shift of 10 mm in a random direction, reproducible for each sequence."""
     seed = [_DIRECTIONS_SEED, *truth.source_key.encode(), truth.raw_start]
     direction = np.random.default_rng(seed).normal(size=3)
     return SHIFT_M * direction / np.linalg.norm(direction)
 
 
 def explained_by_verb(verbs: list[str], lengths: list[int]) -> float:
-    """Share of the variance of clip lengths that the verb's mean explains."""
+    """Return the fraction of the variance of clip lengths that the means of the verbs explain."""
     names, values = np.array(verbs), np.array(lengths, dtype=np.float64)
     means = {verb: values[names == verb].mean() for verb in set(verbs)}
     residual = values - np.array([means[verb] for verb in verbs])
@@ -59,38 +66,40 @@ def explained_by_verb(verbs: list[str], lengths: list[int]) -> float:
 
 
 def check_sequences(sequences: list[TruthSequence], jobs: int = 1) -> pd.DataFrame:
-    """One row per dataset: shares of held frames that pass, extremes in mm, controls, and what the verb explains."""
-    figures: list[SequenceFigures] = [found for _, found in in_workers(sequence_figures, sequences, jobs)]
+    """Return one row per dataset: percentage of lifted frames that pass, extremes in mm, controls, clip lengths."""
+    metrics: list[SequenceMetrics] = [result for _, result in in_workers(sequence_metrics, sequences, jobs)]
     datasets = dict.fromkeys(truth.dataset for truth in sequences)
-    return pd.DataFrame([_row(dataset, [one for one in figures if one.dataset == dataset]) for dataset in datasets])
+    return pd.DataFrame(
+        [_dataset_metrics(dataset, [item for item in metrics if item.dataset == dataset]) for dataset in datasets]
+    )
 
 
-def _row(dataset: str, own: list[SequenceFigures]) -> dict[str, str | int | float]:
-    held = sum(one.held for one in own)
+def _dataset_metrics(dataset: str, sequences: list[SequenceMetrics]) -> dict[str, str | int | float]:
+    lifted = sum(item.lifted for item in sequences)
     return {
         "dataset": dataset,
-        "sequences": len(own),
-        "held frames": held,
-        "pass %": 100 * sum(one.feasible for one in own) / held,
-        "pass % shifted 10 mm": 100 * sum(one.feasible_shifted for one in own) / held,
-        "pass % without contact": 100 * sum(one.feasible_without_contact for one in own) / held,
-        "largest hand-object distance mm": 1000 * max(one.largest_distance_m for one in own),
-        "largest penetration mm": 1000 * max(one.largest_penetration_m for one in own),
+        "sequences": len(sequences),
+        "held frames": lifted,
+        "pass %": 100 * sum(item.feasible for item in sequences) / lifted,
+        "pass % shifted 10 mm": 100 * sum(item.feasible_shifted for item in sequences) / lifted,
+        "pass % without contact": 100 * sum(item.feasible_without_contact for item in sequences) / lifted,
+        "largest hand-object distance mm": 1000 * max(item.largest_distance_m for item in sequences),
+        "largest penetration mm": 1000 * max(item.largest_penetration_m for item in sequences),
         "clip length explained by verb %": 100
-        * explained_by_verb([one.verb for one in own], [one.clip_frames for one in own]),
-        "longest clip": max(one.clip_frames for one in own),
+        * explained_by_verb([item.verb for item in sequences], [item.clip_frames for item in sequences]),
+        "longest clip": max(item.clip_frames for item in sequences),
     }
 
 
 def check_corpus(size: AnySize = "full", seed: int = 0, jobs: int = 2, datasets: tuple[str, ...] = ()) -> pd.DataFrame:
-    """Make the corpora again and measure them. datasets: some of those that have this size; none named: all."""
-    made = [truth for dataset in datasets or datasets_of(size) for truth in make_corpus(dataset, seed, size, jobs)]
-    return check_sequences(made, jobs)
+    """Generate the corpora again and measure them. datasets: by default all that have this size."""
+    sequences = [truth for dataset in datasets or datasets_of(size) for truth in make_corpus(dataset, seed, size, jobs)]
+    return check_sequences(sequences, jobs)
 
 
-def as_text(figures: pd.DataFrame) -> Table:
-    """The figures for the terminal, one dataset per column."""
-    table = Table("", *figures["dataset"])
-    for name in figures.columns[1:]:
-        table.add_row(name, *(f"{value:.4g}" if isinstance(value, float) else str(value) for value in figures[name]))
+def as_text(metrics: pd.DataFrame) -> Table:
+    """Format the metrics for the terminal, one dataset per column."""
+    table = Table("", *metrics["dataset"])
+    for name in metrics.columns[1:]:
+        table.add_row(name, *(f"{value:.4g}" if isinstance(value, float) else str(value) for value in metrics[name]))
     return table

@@ -1,6 +1,6 @@
-"""Placing an open hand over a surface and closing its fingers until they touch, many candidates at once.
+"""Places open hands over a surface and closes their fingers until they touch, for many candidates in one call.
 
-Everything is written for the right hand; for a left hand the caller mirrors the field in x and mirrors the result.
+For the right hand. For a left hand the caller mirrors the field and the result in x.
 """
 
 from collections.abc import Callable
@@ -28,19 +28,19 @@ Field = Callable[[np.ndarray], np.ndarray]
 
 
 def mirrored(field: Field) -> Field:
-    """A field seen in a mirror with normal x: left hands are searched with the right hand's code."""
+    """Mirror a field in x, so that left hands can be searched as right hands."""
     return lambda points_m: field(points_m * np.array([-1.0, 1.0, 1.0]))
 
 
 def gradient(field: Field, points_m: np.ndarray) -> np.ndarray:
-    """Unit outward normals (..., 3) at points near the surface, by central differences."""
+    """Return unit outward normals (..., 3) at points close to the surface, by central differences."""
     steps = _GRADIENT_STEP_M * np.eye(3)
     slope = np.stack([field(points_m + step) - field(points_m - step) for step in steps], axis=-1)
     return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-9)
 
 
 def grid_field(surface: PartSurface) -> Field:
-    """The signed distance of a surface, interpolated in its grid; beyond the grid a lower bound."""
+    """Return the signed distance field of a surface, interpolated in its grid; outside the grid a lower bound."""
     grid = surface.grid
     return lambda points_m: interpolated(grid, points_m.reshape(-1, 3)).reshape(points_m.shape[:-1])
 
@@ -52,57 +52,59 @@ _NORMAL_NOISE = 0.1
 
 
 class Placement(NamedTuple):
-    """Where candidate hands approach an object; one row per candidate, upright object frame, metres and radians.
+    """Placements of candidate hands at an object; upright object frame, metres and radians."""
 
-    rotmats: (row, 3, 3) object-from-hand, its y axis the approach normal. target_m: (row, 3) surface point.
-    blend: (row,) 0 puts the palm over the target, 1 the fingers. gap_m: (row,) clearance at which the hand stops.
-    spread_rad: (row, 5) swing of the fingers. hand: (row,) which hand shape.
-    """
-
-    rotmats: np.ndarray
-    target_m: np.ndarray
-    blend: np.ndarray
-    gap_m: np.ndarray
-    spread_rad: np.ndarray
-    hand: np.ndarray
+    rotmats: np.ndarray  # (candidate, 3, 3) object_from_hand; the y axis is the approach normal
+    target_m: np.ndarray  # (candidate, 3) surface point
+    blend: np.ndarray  # (candidate,) 0 puts the palm over the target, 1 the fingers
+    gap_m: np.ndarray  # (candidate,) clearance at which the hand stops
+    spread_rad: np.ndarray  # (candidate, 5) swing of the fingers
+    hand: np.ndarray  # (candidate,) index of the hand shape
 
     def take(self, rows: np.ndarray) -> "Placement":
         return Placement(*(array[rows] for array in self))
 
     def for_hands(self, n_hands: int) -> "Placement":
-        """Every placement with every hand shape: rows placement-major."""
+        """Combine each placement with each hand shape, placement-major."""
         rows = np.repeat(np.arange(len(self.hand)), n_hands)
         return self.take(rows)._replace(hand=np.tile(np.arange(n_hands), len(self.hand)))
 
 
 def march_to_surface(field: Field, direction: np.ndarray, through_m: np.ndarray) -> np.ndarray:
-    """(row, 3) first surface points met when coming along ``-direction (row, 3)`` towards ``through_m (row, 3)``."""
+    """Return the first surface points (row, 3) along ``-direction`` towards ``through_m``, by sphere tracing."""
     points = through_m + _MARCH_START_M * direction
     for _ in range(40):
         points = points - np.maximum(field(points), 0)[:, None] * direction
     return points
 
 
-def draw_placements(
+def sample_placements(
     field: Field, direction: np.ndarray, through_m: np.ndarray, blend: tuple[float, float], rng: np.random.Generator
 ) -> Placement:
-    """Random placements coming from each ``direction (row, 3)``; rows that miss the object are left out."""
+    """Sample placements that come from each ``direction (row, 3)``, without those that miss the object."""
     surface = march_to_surface(field, direction, through_m)
     direction, surface = (array[field(surface) < 0.003] for array in (direction, surface))
     count = len(surface)
     normal = gradient(field, surface) + _NORMAL_NOISE * rng.normal(size=(count, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    share = rng.uniform(*blend, size=count)
-    power = share < 0.5
-    gap = np.where(power, rng.uniform(-0.001, 0.0005, count), rng.uniform(0, 0.035, count))
-    spread = rng.uniform(-0.05, 0.05, (count, N_FINGERS))
-    spread[:, THUMB] = rng.uniform(-0.25, 0.25, count)
+    palm_to_fingers = rng.uniform(*blend, size=count)
+    is_power_grasp = palm_to_fingers < 0.5
+    gap_m = np.where(is_power_grasp, rng.uniform(-0.001, 0.0005, count), rng.uniform(0, 0.035, count))
+    spread_rad = rng.uniform(-0.05, 0.05, (count, N_FINGERS))
+    spread_rad[:, THUMB] = rng.uniform(-0.25, 0.25, count)
     rotmats = _rolled(normal, rng.uniform(-np.pi, np.pi, count))
-    return Placement(rotmats, surface, share, gap, spread, np.zeros(count, dtype=int))
+    return Placement(
+        rotmats=rotmats,
+        target_m=surface,
+        blend=palm_to_fingers,
+        gap_m=gap_m,
+        spread_rad=spread_rad,
+        hand=np.zeros(count, dtype=int),
+    )
 
 
 def _rolled(normal: np.ndarray, roll: np.ndarray) -> np.ndarray:
-    """Rotations (row, 3, 3) whose y axis is ``normal``, turned about it by ``roll``."""
+    """Return rotations (row, 3, 3) with y axis ``normal``, rotated about it by ``roll``."""
     helper = np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     first = np.cross(normal, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -112,7 +114,7 @@ def _rolled(normal: np.ndarray, roll: np.ndarray) -> np.ndarray:
 
 
 def put_over(field: Field, hands: CapsuleHands, placement: Placement) -> np.ndarray:
-    """(row, 3) wrist positions where the open hand, slid along its normal, first leaves only the gap."""
+    """Move open hands along their normals until only the gap is left. Returns wrist positions (row, 3)."""
     middle, index = hands.joints[:, 4], hands.joints[:, 1]
     palm = 0.75 * middle + 0.1 * index
     fingers = middle + np.array([-0.035, 0.0, 0.012])
@@ -130,9 +132,10 @@ def put_over(field: Field, hands: CapsuleHands, placement: Placement) -> np.ndar
 
 
 def close_fingers(field: Field, hands: CapsuleHands, placement: Placement) -> tuple[np.ndarray, np.ndarray]:
-    """Curl all fingers step by step; a segment that presses the surface stops itself and the joints before it.
+    """Flex all fingers step by step. A segment in contact stops itself and the joints closer to the palm.
 
-    Gives wrist_m (row, 3) and flexion_rad (row, 5, 3).
+    Returns:
+        wrist_m (row, 3) and flexion_rad (row, 5, 3).
     """
     wrist = put_over(field, hands, placement)
     flexion = np.broadcast_to(OPEN_RAD, (len(wrist), N_FINGERS, 3)).copy()
@@ -140,11 +143,11 @@ def close_fingers(field: Field, hands: CapsuleHands, placement: Placement) -> tu
     for _ in range(_LARGEST_STEPS):
         clearance = _finger_clearance(field, hands, placement, wrist, flexion)
         stopped |= clearance <= -PRESS_M
-        # A stopped segment holds every joint between itself and the palm.
+        # A stopped segment also stops all joints between itself and the palm.
         free = ~np.logical_or.accumulate(stopped[..., ::-1], axis=-1)[..., ::-1] & (flexion < LIMITS_RAD - 1e-9)
         if not free.any():
             break
-        # Segments beyond the first free joint are the ones that move.
+        # All segments from the first free joint to the tip move.
         moves = np.logical_or.accumulate(free, axis=-1)
         nearest = np.where(moves, clearance + PRESS_M, np.inf).min(-1, keepdims=True)
         step = np.clip(0.9 * nearest / 0.10, 0.006, 0.10)

@@ -1,4 +1,4 @@
-"""Writing a whole embedded corpus in the raw format of one dataset."""
+"""Writes a whole synthetic corpus in the raw format of one dataset."""
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
@@ -21,11 +21,11 @@ from hoidata.synthetic.write_grab import write_grab_meshes, write_grab_sequence
 from hoidata.synthetic.write_h2o import write_h2o_objects_and_lists, write_h2o_sequence
 from hoidata.workers import in_workers
 
-# "full" and "small" are the embedded corpora; "study" and "study-small" another one.
+# "full" and "small" are the embedded corpora; "study" and "study-small" are the corpus ``study``.
 AnySize = Size | StudySize
 SIZES = ("full", "small", "study", "study-small")
 
-# Per dataset, who writes what all sequences share, and who writes one raw sequence.
+# By dataset: the writer of shared files, and the writer of one raw sequence.
 _WRITERS = {
     "h2o": (write_h2o_objects_and_lists, write_h2o_sequence),
     "grab": (write_grab_meshes, write_grab_sequence),
@@ -36,11 +36,20 @@ _WRITERS = {
 def write_corpus(
     dataset: str, root: str | Path, seed: int = 0, size: AnySize = "full", jobs: int = 2
 ) -> list[TruthSequence]:
-    """Make and write the embedded corpus of "h2o", "grab" or "arctic"; what was below ``root`` is replaced whole.
+    """Generate and write a corpus; it replaces the folder ``root``.
 
-    size: "study" is another corpus than "full", of "grab" and "arctic" alone.
-    Returns the truth it was written from. Bytes depend on dataset, seed and size alone, never on ``jobs``.
-    Raises HoidataError for an unknown dataset or an action that cannot be made sound.
+    Args:
+        dataset: "h2o", "grab" or "arctic"; the study sizes have only "grab" and "arctic".
+        root: folder to write.
+        seed: seed of all random numbers.
+        size: which corpus.
+        jobs: number of worker processes; the result does not depend on it.
+
+    Returns:
+        The ground truth of the corpus.
+
+    Raises:
+        HoidataError: the dataset is unknown, or no plausible sequence was found for an action.
     """
     if dataset not in datasets_of(size):
         raise HoidataError(f"no corpus {size} named {dataset!r}; there are {', '.join(datasets_of(size))}")
@@ -57,46 +66,46 @@ def write_corpus(
 def make_corpus(
     dataset: str, seed: int, size: AnySize, jobs: int, progress: Progress | None = None
 ) -> list[TruthSequence]:
-    """All actions of a corpus as truth, in plan order; equal for equal arguments, whatever ``jobs`` is.
+    """Generate all actions of a corpus in plan order. The result does not depend on ``jobs``.
 
-    progress: shows how far it is. Raises HoidataError where an action cannot be made sound.
+    Raises HoidataError if no plausible sequence was found for an action.
     """
 
-    def run(function: Callable, tasks: Sequence, what: str) -> Iterable[tuple]:
-        found = in_workers(function, tasks, jobs)
-        return found if progress is None else progress.track(found, len(tasks), description=f"{dataset}: {what}")
+    def run(function: Callable, tasks: Sequence, step: str) -> Iterable[tuple]:
+        results = in_workers(function, tasks, jobs)
+        return results if progress is None else progress.track(results, len(tasks), description=f"{dataset}: {step}")
 
     if size in ("full", "small"):
-        made = run(make_action, tasks_of(dataset, seed, size), "making")
+        generated = run(make_action, tasks_of(dataset, seed, size), "making")
     else:
         pools = {
-            (task.thing, task.region): found
-            for task, found in run(find_grasps, pool_tasks(dataset, seed, size), "grasps")
+            (task.object_index, task.region): grasps
+            for task, grasps in run(find_grasps, pool_tasks(dataset, seed, size), "grasps")
         }
-        made = run(make_clips, clip_tasks(dataset, seed, size, pools), "making")
-    return place_in_raw_sequences(dataset, [pair for _, pairs in made for pair in pairs])
+        generated = run(make_clips, clip_tasks(dataset, seed, size, pools), "making")
+    return place_in_raw_sequences(dataset, [pair for _, pairs in generated for pair in pairs])
 
 
 def datasets_of(size: AnySize) -> tuple[str, ...]:
-    """The datasets in whose formats there is a corpus of this size."""
+    """Return the datasets that have a corpus of this size."""
     return tuple(DATASET_IDS if size in ("full", "small") else STUDY_OBJECTS)
 
 
 def write_shared_files(dataset: str, root: Path, sequences: list[TruthSequence], size: AnySize = "full") -> None:
-    """Everything that does not belong to one sequence: meshes, subjects, splits."""
+    """Write the files that all sequences share: meshes, subjects, splits."""
     specs: tuple[ObjectSpec, ...] = OBJECTS[dataset]
     if size not in ("full", "small"):
-        specs = tuple(thing.spec for thing in STUDY_OBJECTS[dataset])
+        specs = tuple(item.spec for item in STUDY_OBJECTS[dataset])
     _WRITERS[dataset][0](root, sequences, specs)
 
 
 def write_raw_sequence(dataset: str, root: Path, members: list[TruthSequence]) -> None:
-    """The files of one raw sequence, which holds ``members`` in their order."""
+    """Write the files of one raw sequence with the actions ``members`` in their order."""
     _WRITERS[dataset][1](root, members, load_embedded_hands())
 
 
 def by_raw_sequence(sequences: list[TruthSequence]) -> list[list[TruthSequence]]:
-    """The actions of each raw sequence, in time order."""
+    """Group the actions by raw sequence, in time order."""
     groups: dict[str, list[TruthSequence]] = {}
     for truth in sequences:
         groups.setdefault(truth.source_key, []).append(truth)

@@ -1,4 +1,4 @@
-"""Making the sequences of one corpus: grasps per action, then actions until each is sound. Any number of jobs."""
+"""Generates the sequences of an embedded corpus: grasps for each action, then rejection sampling of motions."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from hoidata.synthetic.actions import ACTIONS, DATASET_IDS, Entry, Size, plan, s
 from hoidata.synthetic.catalogue import object_model, object_spec
 from hoidata.synthetic.grasps import Grip, Scene
 from hoidata.synthetic.pools import GRASPS_PER_PAIR, search_pool
-from hoidata.synthetic.sequences import Person, draw_length, make_person, make_sequence
+from hoidata.synthetic.sequences import Person, make_person, make_sequence, sample_length
 from hoidata.synthetic.soundness import measure
 from hoidata.synthetic.truth import TruthSequence
 
@@ -28,15 +28,18 @@ class _Task(NamedTuple):
 
 
 def tasks_of(dataset: str, seed: int, size: Size) -> list[_Task]:
-    """One task per action of the plan: they share nothing, so any process may do any of them."""
+    """Return one task per action of the plan. Tasks are independent, so processes can share them."""
     by_action: dict[int, list[tuple[int, Entry]]] = {}
     for position, entry in enumerate(plan(dataset, size)):
         by_action.setdefault(entry.action, []).append((position, entry))
-    return [_Task(dataset, seed, size, action, entries) for action, entries in by_action.items()]
+    return [
+        _Task(dataset=dataset, seed=seed, size=size, action=action, entries=entries)
+        for action, entries in by_action.items()
+    ]
 
 
 def make_action(task: _Task) -> list[tuple[int, TruthSequence]]:
-    """Every sequence of one action, with its position in the plan."""
+    """Generate the sequences of one action, with their positions in the plan."""
     pair = load_embedded_hands()
     order = subjects(task.dataset, task.size)
     names = sorted({entry.subject for _, entry in task.entries}, key=order.index)
@@ -45,9 +48,11 @@ def make_action(task: _Task) -> list[tuple[int, TruthSequence]]:
     spec, model = object_spec(task.dataset, action.object_name), object_model(task.dataset, action.object_name)
     rng = np.random.default_rng([task.seed, DATASET_IDS[task.dataset], _POOL_STREAM, task.action])
     betas = np.stack([person.betas for person in people])
-    pool = search_pool(Scene(spec, model, action.hold.hinge_rad), action.hold, pair, betas, rng)
-    known = dict(zip(names, zip(people, pool, strict=True), strict=True))
-    return [(position, _sound_sequence(task, entry, *known[entry.subject], pair)) for position, entry in task.entries]
+    pool = search_pool(Scene(spec, model, action.grasp.hinge_rad), action.grasp, pair, betas, rng)
+    by_subject = dict(zip(names, zip(people, pool, strict=True), strict=True))
+    return [
+        (position, _sound_sequence(task, entry, *by_subject[entry.subject], pair)) for position, entry in task.entries
+    ]
 
 
 def _number(subject: str) -> int:
@@ -62,37 +67,42 @@ def _person(task: _Task, subject: str, pair: HandPair) -> Person:
 def _sound_sequence(
     task: _Task, entry: Entry, person: Person, grips: list[tuple[Grip, ...]], pair: HandPair
 ) -> TruthSequence:
-    """Draw until the whole action is sound: start, size of the path, the grasp (usual ones first, then reserves)."""
+    """Sample start, path size and grasp until the action is plausible. Reserve grasps come last."""
     dataset, action = task.dataset, ACTIONS[task.dataset][task.action]
     spec, model = object_spec(dataset, action.object_name), object_model(dataset, action.object_name)
     rng = np.random.default_rng([task.seed, DATASET_IDS[dataset], entry.action, _number(entry.subject), entry.number])
-    length = draw_length(dataset, action.verb, rng)
+    length = sample_length(dataset, action.verb, rng)
     grab_key = f"{entry.subject}/{action.object_name}_{action.intent}_{entry.number}"
     key = grab_key if dataset == "grab" else entry.subject
     usual = grips[:GRASPS_PER_PAIR]
-    order = [*(usual[(entry.number + turn) % len(usual)] for turn in range(len(usual))), *grips[GRASPS_PER_PAIR:]]
+    order = [*(usual[(entry.number + number) % len(usual)] for number in range(len(usual))), *grips[GRASPS_PER_PAIR:]]
     for attempt in range(_ATTEMPTS):
         grip = order[attempt % len(order)]
         truth = make_sequence(dataset, action, spec, model, grip, person, key, length, rng)
         if measure(truth, pair).is_sound:
             return truth
     raise HoidataError(
-        f"{dataset}: {action.verb} {action.object_name} by {entry.subject} is not sound after {_ATTEMPTS} draws"
+        f"{dataset}: {action.verb} {action.object_name} by {entry.subject} is not plausible after {_ATTEMPTS} attempts"
     )
 
 
 _ARCTIC_KINDS = ("use", "grab")
-_PLACES = ("h1", "h2", "k1", "k2", "o1", "o2")
+_H2O_ROOMS = ("h1", "h2", "k1", "k2", "o1", "o2")
 _RUNS_PER_SEQUENCE = 3
 GAP_FRAMES = 6
 
 
-def place_in_raw_sequences(dataset: str, made: list[tuple[int, TruthSequence]]) -> list[TruthSequence]:
-    """Sequences in the order of the plan, each given its raw sequence and its first frame there.
+def place_in_raw_sequences(dataset: str, generated: list[tuple[int, TruthSequence]]) -> list[TruthSequence]:
+    """Assign a raw sequence and a first frame to each action. Raw sequences of H2O and ARCTIC have several actions.
 
-    made: with positions in the plan, in any order. H2O and ARCTIC sequences hold several actions.
+    Args:
+        dataset: name of the dataset.
+        generated: actions with their positions in the plan, in any order.
+
+    Returns:
+        The actions in the order of the plan.
     """
-    sequences = [truth for _, truth in sorted(made, key=lambda pair: pair[0])]
+    sequences = [truth for _, truth in sorted(generated, key=lambda pair: pair[0])]
     if dataset == "grab":
         return sequences
     groups: dict[str, list[int]] = {}
@@ -102,7 +112,7 @@ def place_in_raw_sequences(dataset: str, made: list[tuple[int, TruthSequence]]) 
     placed = list(sequences)
     for owner, members in groups.items():
         for chunk, start in enumerate(range(0, len(members), _RUNS_PER_SEQUENCE)):
-            h2o_key = f"{owner}/{_PLACES[chunk // 7]}/{chunk % 7}"
+            h2o_key = f"{owner}/{_H2O_ROOMS[chunk // 7]}/{chunk % 7}"
             key = h2o_key if dataset == "h2o" else f"{owner}_{_ARCTIC_KINDS[chunk % 2]}_{chunk // 2 + 1:02d}"
             frame = GAP_FRAMES
             for index in members[start : start + _RUNS_PER_SEQUENCE]:

@@ -1,8 +1,7 @@
-"""Grasps that could really hold an object: random placement, closing fingers, and a proof of force closure.
+"""Grasp search: random placement, closing of the fingers, and a test of force closure.
 
-Frame of the search: the object standing upright as on the table at the start, origin and hinge where its mesh has them.
-Recipe and measured yields: placements come from a cone of directions, fingers close on capsules (closing.py), and what
-counts in the end is the hand's mesh against the object's mesh.
+Frame of the search: the object upright on the table, with the origin of its mesh. Placements are sampled in a cone of
+directions. Fingers close as capsules (closing.py). The final test uses the meshes of hand and object.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.contact_forces import body_motion, hand_patches, patch_contacts, wrench_columns
 from hoidata.synthetic.catalogue import ObjectSpec
-from hoidata.synthetic.closing import Field, Placement, close_fingers, draw_placements, gradient, grid_field, mirrored
+from hoidata.synthetic.closing import Field, Placement, close_fingers, gradient, grid_field, mirrored, sample_placements
 from hoidata.synthetic.hand_capsules import OPEN_RAD, CapsuleHands, capsule_points, hand_pose_rotvec
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
@@ -32,57 +31,51 @@ STAND_RADIUS_M = 0.02
 _TORQUE_SCALE_M = 0.05
 _CLOSURE_RESIDUAL = 1e-6
 _CAPSULE_CONTACT_M = 0.002
-# On the way in and out: (how far the fingers are closed, how far the hand is withdrawn in metres).
+# Poses during approach and retreat: (closure of the fingers, distance of the hand in metres).
 _STAGES = ((0.75, 0.0), (0.4, 0.0), (0.0, 0.0), (0.0, 0.03))
-# Where the elbow may be, seen from the right wrist: towards the person and outwards, not in front.
+# Direction of the elbow from the right wrist: towards the person and outwards.
 _ELBOW = np.array([0.5, -0.8, 0.2]) / np.linalg.norm([0.5, -0.8, 0.2])
 
 
 @dataclass(frozen=True)
-class Reach:
-    """How one hand comes to the object, written for the upright object and for that very hand.
+class Approach:
+    """How one hand approaches the upright object."""
 
-    direction: from the object to where the hand comes from. width: spread of directions about it.
-    through_m: (3,) point aimed at, or None for the middle of the part. blend: palm (0) to fingers (1).
-    part: None for the whole object, 0 for its base, 1 for its lid.
-    """
-
-    direction: tuple[float, float, float]
-    width: float = 0.4
-    through_m: tuple[float, float, float] | None = None
-    blend: tuple[float, float] = (0.0, 0.8)
-    part: int | None = None
+    direction: tuple[float, float, float]  # from the object to the hand
+    width: float = 0.4  # spread of directions
+    through_m: tuple[float, float, float] | None = None  # target point; None: centre of the part
+    blend: tuple[float, float] = (0.0, 0.8)  # range of the touching region, palm (0) to fingers (1)
+    part: int | None = None  # None: the whole object, 0: base, 1: lid
 
 
 @dataclass(frozen=True)
-class Hold:
-    """Which hands hold an object, and how. hinge_rad: angle while the hands arrive; angles_rad: others to hold at."""
+class GraspSpec:
+    """The hands of a grasp and their approaches."""
 
-    reaches: tuple[tuple[Side, Reach], ...]
-    hinge_rad: float = 0.0
-    angles_rad: tuple[float, ...] = ()
+    approaches: tuple[tuple[Side, Approach], ...]
+    hinge_rad: float = 0.0  # hinge angle when the hands arrive
+    angles_rad: tuple[float, ...] = ()  # hinge angles at which the grasp must be stable
 
     @property
     def hand(self) -> HandType:
-        return "both" if len(self.reaches) == 2 else self.reaches[0][0]
+        return "both" if len(self.approaches) == 2 else self.approaches[0][0]
 
 
 @dataclass(frozen=True)
 class Grip:
-    """One hand on one object. wrist_m (3,), rotmat (3, 3) object-from-hand, canonical object frame at hinge angle 0 of
-    its part; hand_pose (45,) absolute; open_pose (45,) before closing; part: 1 where it follows the lid."""
+    """Pose of one hand on an object, in the frame of the object's part."""
 
     side: Side
-    wrist_m: np.ndarray
-    rotmat: np.ndarray
-    hand_pose: np.ndarray
-    open_pose: np.ndarray
-    part: int
+    wrist_m: np.ndarray  # (3,)
+    rotmat: np.ndarray  # (3, 3) object_from_hand
+    hand_pose: np.ndarray  # (45,) absolute
+    open_pose: np.ndarray  # (45,) before closing
+    part: int  # 1: the hand follows the lid
 
 
 @dataclass(frozen=True)
 class Scene:
-    """An object standing upright, with what the search asks about it."""
+    """An upright object, with its geometry for the grasp search."""
 
     spec: ObjectSpec
     model: ObjectModel
@@ -93,7 +86,7 @@ class Scene:
         return self.spec.upright_from_object
 
     @cached_property
-    def turn(self) -> np.ndarray:
+    def lid_rotation(self) -> np.ndarray:
         """(3, 3) rotation of the lid at the starting angle, upright frame."""
         axis = self.upright @ self.model.hinge.axis if self.model.hinge is not None else np.zeros(3)
         return rotvec_to_rotmat(axis * self.hinge_rad)
@@ -104,14 +97,14 @@ class Scene:
         standing = self.model.vertices_m @ self.upright.T
         if not self.model.is_articulated:
             return [standing]
-        return [standing[self.model.part == 0], standing[self.model.part == 1] @ self.turn.T]
+        return [standing[self.model.part == 0], standing[self.model.part == 1] @ self.lid_rotation.T]
 
     @cached_property
     def part_fields(self) -> list[Field]:
         fields = [grid_field(surface) for surface in surface_index(self.model).filled.values()]
         # Upright points to the rest frame of the part's mesh.
-        turns = [self.upright, self.turn @ self.upright]
-        return [partial(_turned, field, turn) for field, turn in zip(fields, turns, strict=False)]
+        rotations = [self.upright, self.lid_rotation @ self.upright]
+        return [partial(_in_part, field, rotation) for field, rotation in zip(fields, rotations, strict=False)]
 
     def field(self, points_m: np.ndarray) -> np.ndarray:
         """Signed distance of the whole object."""
@@ -123,28 +116,31 @@ class Scene:
 
     @cached_property
     def foot_m(self) -> np.ndarray:
-        """(2,) middle of the base, where the stand is."""
+        """(2,) centre of the base, the position of the stand."""
         return (self.part_vertices[0].min(0) + self.part_vertices[0].max(0))[:2] / 2
 
 
 class Candidates(NamedTuple):
-    """Closed candidate hands of one side, in the right-hand world of the search (mirrored for a left hand).
-
-    hands: a shape per row. wrist_m: (row, 3). flexion_rad: (row, 5, 3).
-    """
+    """Closed candidate hands of one side, in the right-hand world of the search (mirrored for a left hand)."""
 
     side: Side
     placement: Placement
-    hands: CapsuleHands
-    wrist_m: np.ndarray
-    flexion_rad: np.ndarray
+    hands: CapsuleHands  # hand shape of each candidate
+    wrist_m: np.ndarray  # (candidate, 3)
+    flexion_rad: np.ndarray  # (candidate, 5, 3)
 
     def take(self, rows: np.ndarray) -> "Candidates":
         placement, hands = self.placement.take(rows), self.hands.take(rows)
-        return Candidates(self.side, placement, hands, self.wrist_m[rows], self.flexion_rad[rows])
+        return Candidates(
+            side=self.side,
+            placement=placement,
+            hands=hands,
+            wrist_m=self.wrist_m[rows],
+            flexion_rad=self.flexion_rad[rows],
+        )
 
     def points(self, flexion_rad: np.ndarray) -> np.ndarray:
-        """(row, 21, 4, 3) capsule points, with fingers curled by ``flexion_rad (row, 5, 3)``."""
+        """Return (candidate, 21, 4, 3) capsule points, with fingers flexed by ``flexion_rad (candidate, 5, 3)``."""
         return capsule_points(self.hands, self.placement.rotmats, self.wrist_m, flexion_rad, self.placement.spread_rad)
 
     @property
@@ -152,7 +148,7 @@ class Candidates(NamedTuple):
         return np.broadcast_to(OPEN_RAD, self.flexion_rad.shape)
 
 
-def _turned(field: Field, upright_from_part: np.ndarray, points_m: np.ndarray) -> np.ndarray:
+def _in_part(field: Field, upright_from_part: np.ndarray, points_m: np.ndarray) -> np.ndarray:
     return field(points_m @ upright_from_part)
 
 
@@ -160,44 +156,44 @@ def _mirrored(side: Side, field: Field) -> Field:
     return mirrored(field) if side == "left" else field
 
 
-def draw_candidates(scene: Scene, side: Side, reach: Reach, count: int, rng: np.random.Generator) -> Placement:
-    """Placements of one hand that a person standing at -y could take and that keep clear of table and stand."""
+def sample_candidates(scene: Scene, side: Side, approach: Approach, count: int, rng: np.random.Generator) -> Placement:
+    """Sample placements of one hand whose forearm comes from a person at -y."""
     sign = MIRROR if side == "left" else np.ones(3)
-    field = _mirrored(side, scene.part_fields[reach.part or 0] if reach.part is not None else scene.field)
-    vertices = scene.part_vertices[reach.part] if reach.part is not None else np.concatenate(scene.part_vertices)
+    field = _mirrored(side, scene.part_fields[approach.part or 0] if approach.part is not None else scene.field)
+    vertices = scene.part_vertices[approach.part] if approach.part is not None else np.concatenate(scene.part_vertices)
     low, high = vertices.min(0), vertices.max(0)
-    middle = (low + high) / 2 if reach.through_m is None else np.asarray(reach.through_m)
-    extent = (high - low) if reach.through_m is None else np.full(3, 0.02)
-    direction = np.asarray(reach.direction) / np.linalg.norm(reach.direction)
-    direction = direction + reach.width * rng.normal(size=(count, 3))
+    centre = (low + high) / 2 if approach.through_m is None else np.asarray(approach.through_m)
+    extent = (high - low) if approach.through_m is None else np.full(3, 0.02)
+    direction = np.asarray(approach.direction) / np.linalg.norm(approach.direction)
+    direction = direction + approach.width * rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    through = middle + 0.2 * extent * rng.normal(size=(count, 3))
-    placement = draw_placements(field, direction * sign, through * sign, reach.blend, rng)
+    through = centre + 0.2 * extent * rng.normal(size=(count, 3))
+    placement = sample_placements(field, direction * sign, through * sign, approach.blend, rng)
     forearm = placement.rotmats[:, :, 0]
     return placement.take(np.flatnonzero(forearm @ _ELBOW > 0.1))
 
 
 def close_candidates(scene: Scene, side: Side, placement: Placement, hands: CapsuleHands) -> Candidates:
-    """Close the fingers of every placement with its hand shape."""
+    """Close the fingers of each placement with its hand shape."""
     rows = hands.take(placement.hand)
     return Candidates(side, placement, rows, *close_fingers(_mirrored(side, scene.field), rows, placement))
 
 
 def clear_of_table(scene: Scene, candidates: Candidates) -> np.ndarray:
-    """(row,) bool: open and closed, the hand stays above the table and off the stand."""
+    """Return (candidate,) bool: whether the open and the closed hand keep clear of table and stand."""
     clear = np.ones(len(candidates.wrist_m), dtype=bool)
     foot = scene.foot_m * (MIRROR[:2] if candidates.side == "left" else 1.0)
     radii = candidates.hands.radii[:, :, None]
     for flexion in (candidates.open_rad, candidates.flexion_rad):
         points = candidates.points(flexion)
         clear &= (points[..., 2] - radii > scene.bottom_m - scene.spec.stand_m - 0.004).all((1, 2))
-        beside = np.linalg.norm(points[..., :2] - foot, axis=-1) - radii > STAND_RADIUS_M
-        clear &= (beside | (points[..., 2] - radii > scene.bottom_m - 0.004)).all((1, 2))
+        off_stand = np.linalg.norm(points[..., :2] - foot, axis=-1) - radii > STAND_RADIUS_M
+        clear &= (off_stand | (points[..., 2] - radii > scene.bottom_m - 0.004)).all((1, 2))
     return clear
 
 
 def capsule_contacts(scene: Scene, candidates: Candidates) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Per row, contact points and outward normals (contact, 3) in the upright world, at most one per capsule."""
+    """Return, by candidate, contact points and outward normals (contact, 3), upright world; one per capsule."""
     field = _mirrored(candidates.side, scene.field)
     points = candidates.points(candidates.flexion_rad)
     distance = field(points)
@@ -212,9 +208,9 @@ def capsule_contacts(scene: Scene, candidates: Candidates) -> list[tuple[np.ndar
 
 
 def closes_force(points_m: np.ndarray, normals: np.ndarray, centre_m: np.ndarray) -> bool:
-    """Whether the contacts' friction cones span all wrenches: each of the twelve unit wrenches is produced exactly.
+    """Test force closure: the friction cones must produce each of the twelve unit wrenches.
 
-    Every other wrench is a non-negative sum of these twelve, so this proves force closure for any motion.
+    Any other wrench is a non-negative sum of these twelve.
     """
     if len(points_m) < 3:
         return False
@@ -233,7 +229,7 @@ def closes_force(points_m: np.ndarray, normals: np.ndarray, centre_m: np.ndarray
 
 
 def hand_gap_m(candidates: list[Candidates]) -> np.ndarray:
-    """(row,) smallest distance between the two hands' capsules; infinite for one hand."""
+    """Return (candidate,) smallest distance between the two hands' capsules; infinite for one hand."""
     if len(candidates) == 1:
         return np.full(len(candidates[0].wrist_m), np.inf)
     clouds, radii = [], []
@@ -247,7 +243,7 @@ def hand_gap_m(candidates: list[Candidates]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PosedHands:
-    """Candidate hands of one side as true hand parameters, upright world; one row per candidate."""
+    """Candidate hands of one side as hand parameters, upright world."""
 
     side: Side
     wrist_m: np.ndarray
@@ -257,7 +253,7 @@ class PosedHands:
     betas: np.ndarray
 
     def mesh(self, pair: HandPair) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (row, 778, 3) and joints (row, 21, 3), upright world, metres."""
+        """Return vertices (candidate, 778, 3) and joints (candidate, 21, 3), upright world, metres."""
         layer = kinematics_of(pair[self.side], torch.float64)
         local = rotvec_to_rotmat(self.hand_pose.reshape(-1, 15, 3))
         rotmats = np.concatenate([self.rotmats[:, None], local], axis=1)
@@ -269,82 +265,103 @@ class PosedHands:
 
 
 def posed_hands(candidates: Candidates, betas: np.ndarray) -> PosedHands:
-    """Back from the right-hand world of the search to the hand's own side; betas (hand, 10) per hand shape."""
+    """Convert candidates from the right-hand world of the search to hand parameters. betas: (hand shape, 10)."""
     rotmats, spread, rows = candidates.placement.rotmats, candidates.placement.spread_rad, candidates.placement.hand
     pose = hand_pose_rotvec(candidates.hands, candidates.flexion_rad, spread)
     opened = hand_pose_rotvec(candidates.hands, candidates.open_rad, spread)
     if candidates.side == "right":
-        return PosedHands("right", candidates.wrist_m, rotmats, pose, opened, betas[rows])
+        return PosedHands(
+            side="right",
+            wrist_m=candidates.wrist_m,
+            rotmats=rotmats,
+            hand_pose=pose,
+            open_pose=opened,
+            betas=betas[rows],
+        )
     mirror = np.diag(MIRROR)
     pose, opened = (mirror_rotvec_x(one.reshape(-1, 15, 3)).reshape(-1, 45) for one in (pose, opened))
-    return PosedHands("left", candidates.wrist_m * MIRROR, mirror @ rotmats @ mirror, pose, opened, betas[rows])
+    return PosedHands(
+        side="left",
+        wrist_m=candidates.wrist_m * MIRROR,
+        rotmats=mirror @ rotmats @ mirror,
+        hand_pose=pose,
+        open_pose=opened,
+        betas=betas[rows],
+    )
 
 
-def verify(scene: Scene, hold: Hold, hands: list[PosedHands], pair: HandPair) -> np.ndarray:
-    """(row,) score of each candidate against the meshes; 0 where it fails, higher is better.
+def verify(scene: Scene, grasp: GraspSpec, hands: list[PosedHands], pair: HandPair) -> np.ndarray:
+    """Return the (candidate,) score against the meshes: 0 for failure, higher is better.
 
-    At every angle the hold names: force closure, little penetration, and a joint of each hand near the surface.
+    At each hinge angle, a candidate needs force closure, little penetration, and a joint of each hand close to the
+    surface.
     """
     meshes = [hand.mesh(pair) for hand in hands]
     score = np.full(len(hands[0].wrist_m), np.inf)
-    angles = hold.angles_rad or (hold.hinge_rad,)
+    angles = grasp.angles_rad or (grasp.hinge_rad,)
     for angle in angles:
-        score = np.minimum(score, _verify_at(scene, hold, hands, meshes, pair, angle))
+        score = np.minimum(score, _verify_at(scene, grasp, hands, meshes, pair, angle))
     for angle in {angles[0], angles[-1]}:
-        score = np.where(_comes_and_goes(scene, hold, hands, pair, angle), score, 0.0)
+        score = np.where(_can_approach(scene, grasp, hands, pair, angle), score, 0.0)
     return score
 
 
-def _comes_and_goes(scene: Scene, hold: Hold, hands: list[PosedHands], pair: HandPair, angle: float) -> np.ndarray:
-    """(row,) whether opening, half-closed and withdrawing hands, too, stay out of the object."""
-    follow = follow_lid(scene, angle)
+def _can_approach(scene: Scene, grasp: GraspSpec, hands: list[PosedHands], pair: HandPair, angle: float) -> np.ndarray:
+    """Return (candidate,) bool: whether hands also avoid penetration during approach and retreat."""
+    lid_rotation = follow_lid(scene, angle)
     surface, clear = surface_index(scene.model), np.ones(len(hands[0].wrist_m), dtype=bool)
     hinge = np.full(len(clear), angle) if scene.model.is_articulated else None
-    for (_, reach), hand in zip(hold.reaches, hands, strict=True):
-        turn = scene.upright.T @ (follow if reach.part == 1 else np.eye(3))
+    for (_, approach), hand in zip(grasp.approaches, hands, strict=True):
+        object_from_world = scene.upright.T @ (lid_rotation if approach.part == 1 else np.eye(3))
         for closed, away_m in _STAGES:
             pose = hand.open_pose + closed * (hand.hand_pose - hand.open_pose)
             wrist = hand.wrist_m + away_m * hand.rotmats[:, :, 1]
             vertices = replace(hand, hand_pose=pose, wrist_m=wrist).mesh(pair)[0]
-            clear &= surface.depth_m(vertices @ turn.T, hinge).max(1) < LARGEST_PENETRATION_M
+            clear &= surface.depth_m(vertices @ object_from_world.T, hinge).max(1) < LARGEST_PENETRATION_M
     return clear
 
 
-def _verify_at(scene: Scene, hold: Hold, hands, meshes, pair: HandPair, angle: float) -> np.ndarray:
-    n_rows = len(hands[0].wrist_m)
-    hinge = np.full(n_rows, angle) if scene.model.is_articulated else None
-    follow = follow_lid(scene, angle)
+def _verify_at(scene: Scene, grasp: GraspSpec, hands, meshes, pair: HandPair, angle: float) -> np.ndarray:
+    n_candidates = len(hands[0].wrist_m)
+    hinge = np.full(n_candidates, angle) if scene.model.is_articulated else None
+    lid_rotation = follow_lid(scene, angle)
     surface, near, touch, patches = surface_index(scene.model), [], [], []
-    for (side, reach), (vertices, joints) in zip(hold.reaches, meshes, strict=True):
-        turn = scene.upright.T @ (follow if reach.part == 1 else np.eye(3))
-        near.append(surface.nearest(vertices @ turn.T, hinge))
-        touch.append(surface.nearest(joints @ turn.T, hinge).distance_m.min(1))
+    for (side, approach), (vertices, joints) in zip(grasp.approaches, meshes, strict=True):
+        object_from_world = scene.upright.T @ (lid_rotation if approach.part == 1 else np.eye(3))
+        near.append(surface.nearest(vertices @ object_from_world.T, hinge))
+        touch.append(surface.nearest(joints @ object_from_world.T, hinge).distance_m.min(1))
         patches.append(hand_patches(pair[side]))
-    centre = body_motion(scene.model, np.eye(3)[None].repeat(n_rows, 0), np.zeros((n_rows, 3)), hinge).centre_m
-    score = np.zeros(n_rows)
-    for row in range(n_rows):
-        depth = max(-one.distance_m[row].min() for one in near)
-        if depth > LARGEST_PENETRATION_M or max(distance[row] for distance in touch) > LARGEST_JOINT_DISTANCE_M:
+    centre = body_motion(
+        scene.model, np.eye(3)[None].repeat(n_candidates, 0), np.zeros((n_candidates, 3)), hinge
+    ).centre_m
+    score = np.zeros(n_candidates)
+    for index in range(n_candidates):
+        depth = max(-one.distance_m[index].min() for one in near)
+        if depth > LARGEST_PENETRATION_M or max(distance[index] for distance in touch) > LARGEST_JOINT_DISTANCE_M:
             continue
-        contacts = [patch_contacts(one, own, row) for one, own in zip(near, patches, strict=True)]
+        contacts = [patch_contacts(one, patch, index) for one, patch in zip(near, patches, strict=True)]
         points = np.concatenate([contact.points_m for contact in contacts])
         normals = np.concatenate([contact.normals for contact in contacts])
-        if min(len(contact.points_m) for contact in contacts) >= 2 and closes_force(points, normals, centre[row]):
-            score[row] = len(points) + 1 - 100 * depth
+        if min(len(contact.points_m) for contact in contacts) >= 2 and closes_force(points, normals, centre[index]):
+            score[index] = len(points) + 1 - 100 * depth
     return score
 
 
 def follow_lid(scene: Scene, angle: float) -> np.ndarray:
-    """(3, 3) turns a hand on the lid from the starting angle to another, upright frame."""
+    """Return the (3, 3) rotation of a hand on the lid from the start angle to another, upright frame."""
     if scene.model.hinge is None:
         return np.eye(3)
     return rotvec_to_rotmat(scene.upright @ scene.model.hinge.axis * (angle - scene.hinge_rad))
 
 
-def to_grip(scene: Scene, reach: Reach, hands: PosedHands, row: int) -> Grip:
-    """One candidate as a grip in the canonical object frame; on a lid, in the lid's frame at hinge angle 0."""
-    back = scene.upright.T @ (scene.turn.T if reach.part == 1 else np.eye(3))
+def to_grip(scene: Scene, approach: Approach, hands: PosedHands, index: int) -> Grip:
+    """Convert one candidate to a grip in the frame of the object, or of the lid at hinge angle 0."""
+    object_from_world = scene.upright.T @ (scene.lid_rotation.T if approach.part == 1 else np.eye(3))
     return Grip(
-        hands.side, back @ hands.wrist_m[row], back @ hands.rotmats[row],
-        hands.hand_pose[row], hands.open_pose[row], int(reach.part == 1),
-    )  # fmt: skip
+        side=hands.side,
+        wrist_m=object_from_world @ hands.wrist_m[index],
+        rotmat=object_from_world @ hands.rotmats[index],
+        hand_pose=hands.hand_pose[index],
+        open_pose=hands.open_pose[index],
+        part=int(approach.part == 1),
+    )

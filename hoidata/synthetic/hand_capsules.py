@@ -1,6 +1,6 @@
-"""A hand as 21 capsules with five curling fingers: the quick stand-in used while searching for grasps.
+"""A hand as 21 capsules with five flexing fingers: a fast approximation for the grasp search.
 
-Right hand, frame of MANO's rest pose turned about the wrist: fingers along -x, back of the hand +y, thumb +z.
+Right hand, frame of MANO's rest pose rotated about the wrist: fingers along -x, back of the hand +y, thumb +z.
 Fingers in MANO's order: index, middle, pinky, ring, thumb. Finger segments are capsules 0-14, palm regions 15-20.
 """
 
@@ -22,24 +22,20 @@ CURL_RATIO = np.array([[1.0, 1.15, 0.75]] * 4 + [[0.8, 0.6, 0.9]])
 
 
 class CapsuleHands(NamedTuple):
-    """Rest shapes of several hands, wrist at the origin, metres.
+    """Rest shapes of several hands, wrist at the origin, metres."""
 
-    joints: (hand, 16, 3). tips: (hand, 5, 3) centres of the fingertip balls. radii: (hand, 21).
-    flex_axis, swing_axis: (hand, 5, 3) unit axes of curling and of spreading each finger.
-    """
-
-    joints: np.ndarray
-    tips: np.ndarray
-    radii: np.ndarray
-    flex_axis: np.ndarray
-    swing_axis: np.ndarray
+    joints: np.ndarray  # (hand, 16, 3)
+    tips: np.ndarray  # (hand, 5, 3) centres of the fingertip spheres
+    radii: np.ndarray  # (hand, 21)
+    flex_axis: np.ndarray  # (hand, 5, 3) unit axes of flexion
+    swing_axis: np.ndarray  # (hand, 5, 3) unit axes of spreading
 
     def take(self, rows: np.ndarray) -> "CapsuleHands":
         return CapsuleHands(*(array[rows] for array in self))
 
 
 def capsule_hands(model: HandModel, betas: np.ndarray) -> CapsuleHands:
-    """Capsules of a right hand with each of ``betas (hand, 10)``."""
+    """Build the capsules of right hands with ``betas (hand, 10)``."""
     if model.side != "right":
         raise ValueError("capsules are built for the right hand; mirror the scene for a left hand")
     shaped = model.template_m + np.einsum("vck,hk->hvc", model.shape_directions, betas)
@@ -52,15 +48,15 @@ def capsule_hands(model: HandModel, betas: np.ndarray) -> CapsuleHands:
     length = np.linalg.norm(last, axis=2, keepdims=True)
     balls = tips - last / length * np.minimum(radii[:, 2:15:3, None], 0.8 * length)
     flex, swing = _axes(joints, tips)
-    return CapsuleHands(joints, balls, radii, flex, swing)
+    return CapsuleHands(joints=joints, tips=balls, radii=radii, flex_axis=flex, swing_axis=swing)
 
 
 def _radii(model: HandModel, vertices: np.ndarray, joints: np.ndarray) -> np.ndarray:
     ends = np.concatenate([joints[_KNUCKLES + 1], joints[_KNUCKLES + 2], vertices[list(TIP_VERTICES)]])
     starts = np.concatenate([joints[_KNUCKLES], joints[_KNUCKLES + 1], joints[_KNUCKLES + 2]])
     radii = np.empty(21)
-    for row, (start, end) in enumerate(zip(starts, ends, strict=True)):
-        finger, segment = row % 5, row // 5
+    for segment_index, (start, end) in enumerate(zip(starts, ends, strict=True)):
+        finger, segment = segment_index % 5, segment_index // 5
         weight = model.skin_weights[:, _KNUCKLES[finger] + segment]
         radii[3 * finger + segment] = _RADIUS_FACTOR * _bone_radius(vertices, weight, start, end)
     radii[12] = min(radii[12], _LARGEST_THUMB_BASE_M)
@@ -75,10 +71,10 @@ def _radii(model: HandModel, vertices: np.ndarray, joints: np.ndarray) -> np.nda
 def _bone_radius(vertices: np.ndarray, weight: np.ndarray, start: np.ndarray, end: np.ndarray) -> float:
     distance, along = _axis_distance(vertices, start, end)
     for limit in (0.7, 0.4, 0.1):
-        own = (weight > limit) & (along > 0.35) & (along < 0.95)
-        if own.sum() >= 4:
-            return float(np.median(distance[own]))
-    raise ValueError("a finger segment has no vertices of its own")
+        of_segment = (weight > limit) & (along > 0.35) & (along < 0.95)
+        if of_segment.sum() >= 4:
+            return float(np.median(distance[of_segment]))
+    raise ValueError("a finger segment has no vertices")
 
 
 def _axis_distance(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +84,7 @@ def _axis_distance(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> tu
 
 
 def _palm_axes(joints: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Axes of the six palm capsules of one hand or of several: four metacarpals, the thumb's ball, its web."""
+    """Return the axes of the six palm capsules: four metacarpals, ball and web of the thumb."""
     joint = np.moveaxis(joints, -2, 0)
     wrist = joint[0]
     axes = [(wrist + 0.25 * (joint[k] - wrist), joint[k]) for k in (1, 4, 7, 10)]
@@ -97,7 +93,7 @@ def _palm_axes(joints: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _axes(joints: np.ndarray, tips: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Flexion and swing axes. The thumb's are geometric: it closes towards a point in front of the palm."""
+    """Return flexion and swing axes. The thumb closes towards a point in front of the palm."""
     bone = tips - joints[:, _KNUCKLES]
     flex = np.cross(bone, [0.0, -1.0, 0.0])
     swing = np.broadcast_to([0.0, 1.0, 0.0], flex.shape).copy()
@@ -112,7 +108,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def finger_rotmats(hands: CapsuleHands, flexion_rad: np.ndarray, swing_rad: np.ndarray) -> np.ndarray:
-    """(hand, 5, 3, 3, 3) local rotations of the finger joints; flexion (hand, 5, 3), swing (hand, 5) of the first."""
+    """Return (hand, 5, 3, 3, 3) local joint rotations; flexion (hand, 5, 3), swing (hand, 5) of the first joint."""
     flex = _axis_rotations(hands.flex_axis[:, :, None], flexion_rad)
     flex[:, :, 0] = _axis_rotations(hands.swing_axis, swing_rad) @ flex[:, :, 0]
     return flex
@@ -128,7 +124,7 @@ def _axis_rotations(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def hand_pose_rotvec(hands: CapsuleHands, flexion_rad: np.ndarray, swing_rad: np.ndarray) -> np.ndarray:
-    """(hand, 45) absolute axis-angle pose of a right hand in MANO's joint order."""
+    """Return (hand, 45) absolute axis-angle poses of right hands in MANO's joint order."""
     local = finger_rotmats(hands, flexion_rad, swing_rad)
     return rotmat_to_rotvec(local).reshape(len(flexion_rad), 45)
 
@@ -136,7 +132,7 @@ def hand_pose_rotvec(hands: CapsuleHands, flexion_rad: np.ndarray, swing_rad: np
 def capsule_points(
     hands: CapsuleHands, rotmats: np.ndarray, wrist_m: np.ndarray, flexion_rad: np.ndarray, swing_rad: np.ndarray
 ) -> np.ndarray:
-    """(hand, 21, 4, 3) points along every capsule axis, for hands turned by (hand, 3, 3) about wrists (hand, 3)."""
+    """Return (hand, 21, 4, 3) points on the capsule axes, for hands rotated by (hand, 3, 3) about their wrists."""
     local = finger_rotmats(hands, flexion_rad, swing_rad)
     joints = hands.joints
     bones = np.stack(
@@ -147,19 +143,19 @@ def capsule_points(
         ],
         axis=2,
     )
-    turned = np.broadcast_to(np.eye(3), (*bones.shape[:2], 3, 3))
+    rotation = np.broadcast_to(np.eye(3), (*bones.shape[:2], 3, 3))
     positions = [joints[:, _KNUCKLES]]
     for segment in range(3):
-        turned = turned @ local[:, :, segment]
-        positions.append(positions[-1] + (turned @ bones[:, :, segment, :, None])[..., 0])
+        rotation = rotation @ local[:, :, segment]
+        positions.append(positions[-1] + (rotation @ bones[:, :, segment, :, None])[..., 0])
     chain = np.stack(positions, axis=2)
     starts = chain[:, :, :3].reshape(len(chain), 15, 3)
     ends = chain[:, :, 1:].reshape(len(chain), 15, 3)
     palm = _palm_axes(joints)
     starts = np.concatenate([starts, np.stack([start for start, _ in palm], axis=1)], axis=1)
     ends = np.concatenate([ends, np.stack([end for _, end in palm], axis=1)], axis=1)
-    share = np.linspace(0, 1, N_SAMPLES)[:, None]
-    points = starts[:, :, None] + share * (ends - starts)[:, :, None]
+    fraction = np.linspace(0, 1, N_SAMPLES)[:, None]
+    points = starts[:, :, None] + fraction * (ends - starts)[:, :, None]
     return (points.reshape(len(points), -1, 3) @ rotmats.transpose(0, 2, 1)).reshape(points.shape) + wrist_m[
         :, None, None
     ]

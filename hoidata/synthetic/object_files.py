@@ -1,4 +1,4 @@
-"""What the writers of the three formats share: text, meshes, and NumPy's object files as NumPy 1 wrote them."""
+"""File formats that the three writers share: text, meshes, and object arrays in the format of NumPy 1."""
 
 import io
 import pickle
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-# What real files name: they were pickled by NumPy 1, before numpy.core became numpy._core.
+# Real files were pickled by NumPy 1, before numpy.core became numpy._core.
 _NEW_SPELLING, _OLD_SPELLING = b"cnumpy._core.", b"cnumpy.core."
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 
@@ -19,7 +19,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def obj_text(vertices: np.ndarray, faces: np.ndarray) -> str:
-    """A Wavefront OBJ of vertices (vertex, 3) in whatever unit, and triangles."""
+    """Format vertices (vertex, 3) and triangles as Wavefront OBJ."""
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
     lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
     return "\n".join(lines) + "\n"
@@ -39,7 +39,7 @@ def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
 
 
 def npy_bytes(value: Any) -> bytes:
-    """An .npy file: plain arrays and scalars plainly, a dict as the 0-d object array NumPy 1 made of it."""
+    """Return the bytes of an .npy file. A dict becomes a 0-d object array, as in NumPy 1."""
     stream = io.BytesIO()
     if not isinstance(value, dict):
         np.lib.format.write_array(stream, np.asanyarray(value), allow_pickle=False)
@@ -57,7 +57,7 @@ def write_npy(path: Path, value: Any) -> None:
 
 
 def write_npz(path: Path, members: dict[str, Any]) -> None:
-    """An .npz of 0-d members; equal members give equal bytes."""
+    """Write an .npz of 0-d members; equal members give equal bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, value in members.items():

@@ -1,7 +1,7 @@
-"""How objects move under each verb: a few keyframes over the phase of the action, joined by minimum-jerk curves.
+"""Object motion of each verb: keyframes over the phase of the action, joined by minimum-jerk curves.
 
-Offsets are metres from where the object stood, in the world (z up, person at -y, x to the person's right), rotations
-degrees about world axes through the object's middle. Written for the right hand; a left hand's is the mirror image.
+Shifts are metres from the start position, in the world (z up, person at -y, x to the person's right). Rotations are
+degrees about world axes through the object's centre. Defined for the right hand; left hands use the mirror image.
 """
 
 from dataclasses import dataclass
@@ -11,41 +11,40 @@ import numpy as np
 
 
 class Key(NamedTuple):
-    """phase in 0..1; shift (x, y, z) in m; turn (x, y, z) rotation vector in degrees; hinge angle in rad."""
+    """A keyframe."""
 
-    phase: float
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    hinge: float = 0.0
+    phase: float  # 0 to 1
+    shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # rotation vector
+    hinge: float = 0.0  # radians; a fraction of the range in the corpus ``study``
 
 
 class Swing(NamedTuple):
-    """A sine on top of the path between two phases: whole cycles, amplitude of shift (m) and turn (degrees)."""
+    """A sine added to the path between two phases."""
 
     start: float
     stop: float
     cycles: int
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # amplitude
+    rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # amplitude
 
 
 @dataclass(frozen=True)
 class Motion:
-    """keys: path while the action lasts. lifted_before, lowered_after: 30 fps frames in which the hands, in contact,
-    bring the object to the first key before the action and back to the table after it (0: it starts or ends there)."""
+    """The motion of an object during an action."""
 
     keys: tuple[Key, ...]
     swing: Swing | None = None
-    lifted_before: int = 0
-    lowered_after: int = 0
+    lifted_before: int = 0  # frames at 30 fps to lift the object to the first key; 0: the action starts on the table
+    lowered_after: int = 0  # frames at 30 fps to lower it after the last key; 0: the action ends on the table
 
 
 class ObjectPath(NamedTuple):
-    """shift_m (frame, 3), turn_rad (frame, 3) rotation vectors, hinge_rad (frame,)."""
+    """The motion of an object, frame by frame."""
 
-    shift_m: np.ndarray
-    turn_rad: np.ndarray
-    hinge_rad: np.ndarray
+    shift_m: np.ndarray  # (frame, 3)
+    rotation_rad: np.ndarray  # (frame, 3) rotation vectors
+    hinge_rad: np.ndarray  # (frame,)
 
 
 UP = (0.0, 0.0, 0.16)
@@ -113,7 +112,7 @@ MOTIONS: dict[str, Motion] = {
     ),
     "use": Motion(
         (Key(0), Key(0.08), Key(0.26, (0, 0.08, 0.14)), Key(0.8, (0, 0.08, 0.14)), Key(0.97), Key(1)),
-        Swing(0.26, 0.8, 3, (0, 0, 0.03), (0, 22, 0)),
+        Swing(start=0.26, stop=0.8, cycles=3, shift_m=(0, 0, 0.03), rotation_deg=(0, 22, 0)),
     ),
     "drink": Motion(
         (Key(0), Key(0.08), Key(0.28, (0, -0.13, 0.24)), Key(0.42, (0, -0.2, 0.27), (50, 0, 0)),
@@ -148,24 +147,30 @@ MOTIONS: dict[str, Motion] = {
     ),
 }  # fmt: skip
 _MIRRORED_SHIFT = np.array([-1.0, 1.0, 1.0])
-_MIRRORED_TURN = np.array([1.0, -1.0, -1.0])
+_MIRRORED_ROTATION = np.array([1.0, -1.0, -1.0])
 
 
-def minimum_jerk(share: np.ndarray) -> np.ndarray:
-    """0 to 1 with zero velocity and acceleration at both ends; clipped outside."""
-    x = np.clip(share, 0.0, 1.0)
+def minimum_jerk(fraction: np.ndarray) -> np.ndarray:
+    """Map 0..1 to 0..1 with zero velocity and acceleration at both ends; clipped outside."""
+    x = np.clip(fraction, 0.0, 1.0)
     return x**3 * (10 - 15 * x + 6 * x**2)
 
 
 def follow_path(
-    motion: Motion, frames: np.ndarray, start: float, length: float, mirrored: bool, size: float, turn_size: float
+    motion: Motion, frames: np.ndarray, start: float, length: float, mirrored: bool, size: float, rotation_scale: float
 ) -> ObjectPath:
-    """The path at times ``frames`` (30 fps units, may be fractions) of an action from ``start`` lasting ``length``.
+    """Evaluate the path of an action, with lifting before and lowering after it.
 
-    Before and after it the object is lifted and lowered as the motion says. size, turn_size scale shifts and turns.
+    Args:
+        motion: keyframes.
+        frames: (frame,) times in frames at 30 fps, possibly fractions.
+        start, length: start and duration of the action, in the same unit.
+        mirrored: whether a left hand acts.
+        size: scale of the shifts.
+        rotation_scale: scale of the rotations.
     """
     times = [start + key.phase * length for key in motion.keys]
-    keys = np.array([(*key.shift, *np.deg2rad(key.turn), key.hinge) for key in motion.keys], dtype=np.float64)
+    keys = np.array([(*key.shift_m, *np.deg2rad(key.rotation_deg), key.hinge) for key in motion.keys], dtype=np.float64)
     if motion.lifted_before:
         times, keys = [start - motion.lifted_before, *times], np.concatenate([_rest(keys[0], at_start=True), keys])
     if motion.lowered_after:
@@ -174,14 +179,14 @@ def follow_path(
     values = _between(np.array(times), keys, frames)
     if motion.swing is not None:
         values[:, :6] += _swinging(motion.swing, (frames - start) / length)
-    shift, turn = values[:, :3] * size, values[:, 3:6] * turn_size
+    shift_m, rotation_rad = values[:, :3] * size, values[:, 3:6] * rotation_scale
     if mirrored:
-        shift, turn = shift * _MIRRORED_SHIFT, turn * _MIRRORED_TURN
-    return ObjectPath(shift, turn, values[:, 6])
+        shift_m, rotation_rad = shift_m * _MIRRORED_SHIFT, rotation_rad * _MIRRORED_ROTATION
+    return ObjectPath(shift_m, rotation_rad, values[:, 6])
 
 
 def _rest(key: np.ndarray, at_start: bool) -> np.ndarray:
-    """The table below a key: where the object started, or straight down from where it is."""
+    """Return the key on the table before or after an action: the start position, or straight below the last key."""
     down = key.copy()
     down[0:2] = 0.0 if at_start else key[0:2]
     down[2:6] = 0.0
@@ -190,12 +195,12 @@ def _rest(key: np.ndarray, at_start: bool) -> np.ndarray:
 
 def _between(times: np.ndarray, keys: np.ndarray, frames: np.ndarray) -> np.ndarray:
     segment = np.clip(np.searchsorted(times, frames, side="right") - 1, 0, len(times) - 2)
-    share = minimum_jerk((frames - times[segment]) / (times[segment + 1] - times[segment]))
-    return keys[segment] + share[:, None] * (keys[segment + 1] - keys[segment])
+    fraction = minimum_jerk((frames - times[segment]) / (times[segment + 1] - times[segment]))
+    return keys[segment] + fraction[:, None] * (keys[segment + 1] - keys[segment])
 
 
 def _swinging(swing: Swing, phase: np.ndarray) -> np.ndarray:
-    share = np.clip((phase - swing.start) / (swing.stop - swing.start), 0.0, 1.0)
-    envelope = minimum_jerk(5 * share) * minimum_jerk(5 * (1 - share))
-    amplitude = np.array([*swing.shift, *np.deg2rad(swing.turn)])
-    return (envelope * np.sin(2 * np.pi * swing.cycles * share))[:, None] * amplitude
+    fraction = np.clip((phase - swing.start) / (swing.stop - swing.start), 0.0, 1.0)
+    envelope = minimum_jerk(5 * fraction) * minimum_jerk(5 * (1 - fraction))
+    amplitude = np.array([*swing.shift_m, *np.deg2rad(swing.rotation_deg)])
+    return (envelope * np.sin(2 * np.pi * swing.cycles * fraction))[:, None] * amplitude

@@ -1,4 +1,4 @@
-"""From a grasp and a path to a whole action: approach, close, carry, open, retreat."""
+"""Builds a whole action from a grasp and a path: approach, close, carry, open, retreat."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,11 +15,11 @@ from hoidata.synthetic.grasps import Grip
 from hoidata.synthetic.paths import ObjectPath, follow_path, minimum_jerk
 from hoidata.synthetic.truth import TruthSequence
 
-# In 30 fps frames: the hand travels, closes, opens, travels away.
+# Durations in frames at 30 fps.
 APPROACH, CLOSE, OPEN, RETREAT = 10, 4, 3, 8
-LED_IN, LED_OUT = 6, 4
+LED_IN, LED_OUT = 6, 4  # frames of a labelled clip before and after the action
 _AWAY_M = 0.22
-HELD_ABOVE_M = 0.015
+LIFTED_ABOVE_M = 0.015
 SOURCE_FPS = {"h2o": 30, "grab": 120, "arctic": 30}
 _IDLE_RIGHT_M = np.array([0.6, -0.35, 0.05])
 # Idle right hand, palm down, fingers forward: hand x to -y, back of the hand up, thumb to -x.
@@ -31,17 +31,17 @@ Span = tuple[float, float]
 
 @dataclass(frozen=True)
 class Timing:
-    """In 30 fps frames, possibly fractions: first firm contact, start and length of the action proper, last contact."""
+    """Times of an action in frames at 30 fps, possibly fractions."""
 
     contact_start: float
-    start: float
-    length: float
+    start: float  # of the path
+    length: float  # of the path
     contact_stop: float
-    end: float
+    end: float  # of the retreat
 
 
 class Pace(NamedTuple):
-    """In 30 fps frames: the hand travels, closes, opens, travels away."""
+    """Durations of the phases of a hand, in frames at 30 fps."""
 
     approach: int = APPROACH
     close: int = CLOSE
@@ -54,30 +54,36 @@ USUAL_PACE = Pace()
 
 @dataclass(frozen=True)
 class Person:
-    """subject: name. betas: (10,). template_m: (778, 3) personal rest mesh per side, or None where betas say it all."""
+    """A subject and the shape of the hands."""
 
     subject: str
-    betas: np.ndarray
-    template_m: dict[Side, np.ndarray] | None
+    betas: np.ndarray  # (10,)
+    template_m: dict[Side, np.ndarray] | None  # (778, 3) personal rest mesh of each side; None: betas give the shape
 
 
-def draw_length(dataset: str, verb: str, rng: np.random.Generator) -> int:
-    """Length of a clip in 30 fps frames: about the verb's mean."""
+def sample_length(dataset: str, verb: str, rng: np.random.Generator) -> int:
+    """Sample the length of a clip around the mean of its verb, in frames at 30 fps."""
     length = MEAN_LENGTH[dataset][verb] + LENGTH_DEVIATION * rng.normal()
     return int(np.clip(round(length), SHORTEST_CLIP, LONGEST_CLIP))
 
 
 def plan_timing(dataset: str, action: Action, length: int, rng: np.random.Generator) -> Timing:
-    """When what happens, so that the labelled clip has the given length (GRAB: firm contact alone is the clip)."""
+    """Schedule an action such that the labelled clip has the given length. A clip of GRAB is the contact alone."""
     motion = action.motion
-    fine = SOURCE_FPS[dataset] // FPS
-    contact_start = APPROACH + CLOSE + (int(rng.integers(fine)) / fine if fine > 1 else 0.0)
+    stride = SOURCE_FPS[dataset] // FPS
+    contact_start = APPROACH + CLOSE + (int(rng.integers(stride)) / stride if stride > 1 else 0.0)
     before, after = (0, 0) if dataset == "grab" else (motion.lifted_before, motion.lowered_after)
-    led = 0 if dataset == "grab" else LED_IN * (before == 0) + LED_OUT * (after == 0)
-    proper = length - led
+    lead_frames = 0 if dataset == "grab" else LED_IN * (before == 0) + LED_OUT * (after == 0)
+    path_length = length - lead_frames
     start = contact_start + before
-    contact_stop = start + proper + after
-    return Timing(contact_start, start, proper, contact_stop, contact_stop + OPEN + RETREAT)
+    contact_stop = start + path_length + after
+    return Timing(
+        contact_start=contact_start,
+        start=start,
+        length=path_length,
+        contact_stop=contact_stop,
+        end=contact_stop + OPEN + RETREAT,
+    )
 
 
 def make_sequence(
@@ -91,26 +97,30 @@ def make_sequence(
     length: int,
     rng: np.random.Generator,
 ) -> TruthSequence:
-    """One action at the source's frame rate; everything random comes from ``rng``."""
+    """Generate one action at the frame rate of the source."""
     timing = plan_timing(dataset, action, length, rng)
     fps = SOURCE_FPS[dataset]
     times = np.arange(int(np.floor(timing.end * fps / FPS)) + 1) * (FPS / fps)
-    hand = action.hold.hand
-    size, turn_size = rng.uniform(0.9, 1.1, 2)
-    path = follow_path(action.motion, times, timing.start, timing.length, hand == "left", float(size), float(turn_size))
+    hand = action.grasp.hand
+    size, rotation_scale = rng.uniform(0.9, 1.1, 2)
+    path = follow_path(
+        action.motion, times, timing.start, timing.length, hand == "left", float(size), float(rotation_scale)
+    )
     rotmats, translation = object_pose(spec, model, path, rng)
     hinge = path.hinge_rad if model.is_articulated else None
     idle_absent = dataset == "h2o" and bool(rng.random() < 0.5)
     hands: dict[Side, HandTrack] = {side: idle_hand(side, person, len(times), rng, not idle_absent) for side in SIDES}
     track = ObjectTrack(model, rotmat_to_rotvec(rotmats), translation, hinge)
     for grip in grips:
-        hands[grip.side] = acting_hand(grip, person, track, rotmats, times, (timing.contact_start, timing.contact_stop))
+        hands[grip.side] = grasping_hand(
+            grip, person, track, rotmats, times, (timing.contact_start, timing.contact_stop)
+        )
     contact = (round(timing.contact_start * fps / FPS), round(timing.contact_stop * fps / FPS) + 1)
     return TruthSequence(
         dataset=dataset, subject=person.subject, source_key=source_key, raw_start=0, source_fps=fps, verb=action.verb,
         object_name=spec.name, object_words=spec.words, intent=action.intent, hand_type=hand, hands=hands,
         object=track, clip=_clip_span(dataset, action, timing, contact), contact=contact,
-        held=lowest_point(track) > spec.stand_m + HELD_ABOVE_M, stand_m=spec.stand_m,
+        lifted=lowest_point(track) > spec.stand_m + LIFTED_ABOVE_M, stand_m=spec.stand_m,
     )  # fmt: skip
 
 
@@ -125,23 +135,23 @@ def _clip_span(dataset: str, action: Action, timing: Timing, contact: tuple[int,
 def object_pose(
     spec: ObjectSpec, model: ObjectModel, path: ObjectPath, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """World-from-object rotations (frame, 3, 3) and translations (frame, 3), from a start near the world's origin."""
+    """Return world_from_object rotations (frame, 3, 3) and translations (frame, 3), with a start close to zero."""
     base = model.vertices_m[model.part == 0]
-    middle = (base.min(0) + base.max(0)) / 2
+    centre = (base.min(0) + base.max(0)) / 2
     upright = spec.upright_from_object
     standing = articulate(model.vertices_m, model.part, model.hinge, path.hinge_rad[:1])[0] @ upright.T
     start = np.array([*np.clip(0.025 * rng.normal(size=2), -0.06, 0.06), spec.stand_m - standing[:, 2].min()])
-    start[2] += (upright @ middle)[2]
+    start[2] += (upright @ centre)[2]
     yaw = np.deg2rad(np.clip(10 * rng.normal(), -25, 25))
     at_rest = rotvec_to_rotmat(np.array([0.0, 0.0, yaw])) @ upright
-    rotmats = rotvec_to_rotmat(path.turn_rad) @ at_rest
-    return rotmats, start + path.shift_m - rotmats @ middle
+    rotmats = rotvec_to_rotmat(path.rotation_rad) @ at_rest
+    return rotmats, start + path.shift_m - rotmats @ centre
 
 
-def acting_hand(
+def grasping_hand(
     grip: Grip, person: Person, track: ObjectTrack, rotmats, times: np.ndarray, contact: Span, pace: Pace = USUAL_PACE
 ) -> HandTrack:
-    """The hand fixed to its part of the object while it holds; before and after, straight away along its back."""
+    """Return a hand that is fixed to the object during contact, and approaches and retreats along its back."""
     model, hinge = track.model, track.hinge_rad
     follow = rotmats
     if grip.part == 1 and model.hinge is not None and hinge is not None:
@@ -157,9 +167,9 @@ def acting_hand(
 
 
 def idle_hand(side: Side, person: Person, n_frames: int, rng: np.random.Generator, present: bool) -> HandTrack:
-    """A relaxed hand that drifts a little, far to its own side of the object."""
-    share = np.linspace(0, 1, n_frames)[:, None]
-    drift = 0.03 * rng.normal(size=3) + 0.02 * share * rng.normal(size=3)
+    """Return a relaxed hand that drifts slightly, far from the object on its side."""
+    fraction = np.linspace(0, 1, n_frames)[:, None]
+    drift = 0.03 * rng.normal(size=3) + 0.02 * fraction * rng.normal(size=3)
     wrist, orient = _IDLE_RIGHT_M + drift, np.tile(rotmat_to_rotvec(_IDLE_RIGHT), (n_frames, 1))
     curl = np.tile([0.0, 0.0, 0.25], 15) * np.repeat([1.0, 1.0, 1.0, 1.0, 0.3], 9)
     pose = np.tile(curl + 0.03 * rng.normal(size=45), (n_frames, 1))
@@ -173,11 +183,18 @@ def idle_hand(side: Side, person: Person, n_frames: int, rng: np.random.Generato
 def hand_track(person: Person, side: Side, wrist, orient, pose, present: bool) -> HandTrack:
     betas = person.betas if person.template_m is None else np.zeros(10)
     template = None if person.template_m is None else person.template_m[side]
-    return HandTrack(wrist, orient, pose, betas[None], np.full(len(wrist), present), template)
+    return HandTrack(
+        wrist_m=wrist,
+        global_orient=orient,
+        hand_pose=pose,
+        betas=betas[None],
+        valid=np.full(len(wrist), present),
+        template_m=template,
+    )
 
 
 def make_person(dataset: str, subject: str, pair: HandPair, rng: np.random.Generator) -> Person:
-    """A subject with hands of its own; GRAB files a personal mesh instead of betas, in float32."""
+    """Sample a subject with individual hands. GRAB stores a personal mesh instead of betas, in float32."""
     betas = np.round(np.clip(0.6 * rng.normal(size=10), -1.5, 1.5), 6).astype(np.float32).astype(np.float64)
     if dataset != "grab":
         return Person(subject, betas, None)
@@ -189,7 +206,7 @@ def make_person(dataset: str, subject: str, pair: HandPair, rng: np.random.Gener
 
 
 def lowest_point(track: ObjectTrack) -> np.ndarray:
-    """(frame,) height of the object's lowest vertex."""
+    """Return (frame,) height of the object's lowest vertex."""
     model = track.model
     points = articulate(model.vertices_m, model.part, model.hinge, track.hinge_rad)
     up = rotvec_to_rotmat(track.rotvec)[:, 2]

@@ -11,10 +11,10 @@ _WELD_DIGITS = 6
 
 
 class Solid(NamedTuple):
-    """vertices_m: (vertex, 3); faces: (face, 3) int64, outward by the right-hand rule."""
+    """A closed triangle mesh."""
 
-    vertices_m: np.ndarray
-    faces: np.ndarray
+    vertices_m: np.ndarray  # (vertex, 3)
+    faces: np.ndarray  # (face, 3) int64, outward by the right-hand rule
 
     def moved(self, offset_m: tuple[float, float, float]) -> "Solid":
         return Solid(self.vertices_m + np.asarray(offset_m, dtype=np.float64), self.faces)
@@ -29,7 +29,7 @@ def sharp_box(size_m: tuple[float, float, float]) -> Solid:
 
 
 def rounded_box(size_m: tuple[float, float, float], radius_m: float = 0.004, spacing_m: float = 0.012) -> Solid:
-    """A box about the origin with rounded edges; no edge of the mesh is longer than about 1.5 x spacing."""
+    """A box about the origin with rounded edges; edges of the mesh are at most about 1.5 x ``spacing_m`` long."""
     half = np.asarray(size_m) / 2
     box = _grid_box([_rounded_axis(extent, radius_m, spacing_m) for extent in half])
     inner = np.clip(box.vertices_m, radius_m - half, half - radius_m)
@@ -39,7 +39,7 @@ def rounded_box(size_m: tuple[float, float, float], radius_m: float = 0.004, spa
 
 
 def _rounded_axis(half_m: float, radius_m: float, spacing_m: float) -> np.ndarray:
-    """Grid lines of one axis: three over each rounded strip, so that they spread evenly over the quarter turn."""
+    """Grid lines of one axis, with three over each rounded edge at equal angles."""
     strip = half_m - radius_m + radius_m * np.tan(np.pi / 4 * np.linspace(0, 1, 4))
     count = max(int(np.ceil(2 * (half_m - radius_m) / spacing_m)), 1)
     middle = np.linspace(radius_m - half_m, half_m - radius_m, count + 1)
@@ -71,9 +71,12 @@ def _compact(vertices: np.ndarray, faces: np.ndarray) -> Solid:
 
 
 def revolved(profile: ArrayLike, sections: int = 40, spacing_m: float = 0.012) -> Solid:
-    """The solid swept by a profile of (radius, height) points about the z axis, from the axis below to the axis above.
+    """Solid of revolution about the z axis.
 
-    The first and last points lie on the axis. Segments longer than ``spacing_m`` are cut.
+    Args:
+        profile: (point, 2) radius and height, from bottom to top; the first and last points are on the axis.
+        sections: number of sections around the axis.
+        spacing_m: longer segments of the profile are subdivided.
     """
     points = _subdivided(np.asarray(profile, dtype=np.float64), spacing_m)
     if abs(points[0, 0]) > 1e-12 or abs(points[-1, 0]) > 1e-12:
@@ -82,15 +85,15 @@ def revolved(profile: ArrayLike, sections: int = 40, spacing_m: float = 0.012) -
     n_rings = len(points) - 2
     vertices = np.concatenate([rings.reshape(-1, 3), [[0, 0, points[0, 1]], [0, 0, points[-1, 1]]]])
     faces = [_split_quads(_ring_quads(n_rings, sections, wrap=False))]
-    here, after = np.arange(sections), (np.arange(sections) + 1) % sections
+    current, following = np.arange(sections), (np.arange(sections) + 1) % sections
     low, high, top = len(vertices) - 2, len(vertices) - 1, (n_rings - 1) * sections
-    faces.append(np.stack([np.full(sections, low), after, here], axis=1))
-    faces.append(np.stack([np.full(sections, high), top + here, top + after], axis=1))
+    faces.append(np.stack([np.full(sections, low), following, current], axis=1))
+    faces.append(np.stack([np.full(sections, high), top + current, top + following], axis=1))
     return Solid(vertices, np.concatenate(faces).astype(np.int64))
 
 
 def torus(radius_m: float, tube_m: float, sections: int = 48, tube_sections: int = 20) -> Solid:
-    """A torus about the z axis: ``radius_m`` to the middle of a tube of radius ``tube_m``."""
+    """A torus about the z axis: ``radius_m`` to the centre of a tube of radius ``tube_m``."""
     angle = 2 * np.pi * np.arange(tube_sections) / tube_sections
     ring = np.stack([radius_m + tube_m * np.cos(angle), tube_m * np.sin(angle)], axis=1)
     rings = _rings(ring, sections)
@@ -106,10 +109,15 @@ def _rings(profile: np.ndarray, sections: int) -> np.ndarray:
 
 def _ring_quads(n_rings: int, sections: int, wrap: bool) -> np.ndarray:
     ring = np.arange(n_rings if wrap else n_rings - 1)[:, None]
-    here = np.arange(sections)[None]
-    after = (here + 1) % sections
+    current = np.arange(sections)[None]
+    following = (current + 1) % sections
     above = (ring + 1) % n_rings
-    corners = [ring * sections + here, ring * sections + after, above * sections + after, above * sections + here]
+    corners = [
+        ring * sections + current,
+        ring * sections + following,
+        above * sections + following,
+        above * sections + current,
+    ]
     return np.stack(np.broadcast_arrays(*corners), axis=-1).reshape(-1, 4)
 
 
@@ -131,15 +139,15 @@ def sphere(radius_m: float, sections: int = 40) -> Solid:
 
 def cylinder(radius_m: float, height_m: float, edge_m: float = 0.003, sections: int = 40) -> Solid:
     """An upright cylinder about the origin with rounded rims."""
-    turn = np.linspace(0, np.pi / 2, 4)
+    angle = np.linspace(0, np.pi / 2, 4)
     half = height_m / 2
-    rim = [(radius_m - edge_m + edge_m * np.sin(a), half - edge_m + edge_m * np.cos(a)) for a in turn]
+    rim = [(radius_m - edge_m + edge_m * np.sin(a), half - edge_m + edge_m * np.cos(a)) for a in angle]
     below = [(r, -z) for r, z in rim]
     return revolved([(0.0, -half), *below, *reversed(rim), (0.0, half)], sections)
 
 
 def united(*solids: Solid) -> Solid:
-    """The exact union of closed solids (CGAL's arithmetic, through libigl): one closed surface."""
+    """Unite closed solids to one closed surface, with the exact arithmetic of CGAL through libigl."""
     whole = solids[0]
     for solid in solids[1:]:
         vertices, faces, _ = cgal.mesh_boolean(
@@ -154,13 +162,13 @@ def united(*solids: Solid) -> Solid:
 
 
 def _welded(vertices: np.ndarray, faces: np.ndarray) -> Solid:
-    """Vertices on a grid of a micrometre, equal ones made one, collapsed triangles left out: files keep it closed.
+    """Round vertices to a micrometre, merge equal ones and drop collapsed triangles, so that files stay closed.
 
-    Triangles begin with their lowest vertex and are sorted: CGAL begins and lists them differently from run to run.
+    Triangles start with their lowest vertex and are sorted, because CGAL's order differs from run to run.
     """
     unique, inverse = np.unique(np.round(vertices, _WELD_DIGITS), axis=0, return_inverse=True)
     a, b, c = inverse.reshape(-1)[faces].T
-    kept = (a != b) & (b != c) & (c != a)
-    corners = np.stack([a, b, c], axis=1)[kept]
-    turned = np.take_along_axis(corners, (corners.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
-    return _compact(unique, turned[np.lexsort(turned.T[::-1])])
+    is_valid = (a != b) & (b != c) & (c != a)
+    corners = np.stack([a, b, c], axis=1)[is_valid]
+    rotated = np.take_along_axis(corners, (corners.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    return _compact(unique, rotated[np.lexsort(rotated.T[::-1])])

@@ -1,4 +1,4 @@
-"""Whether a synthetic action is physically sound, measured on the hands' meshes against the object's mesh."""
+"""Checks that a synthetic action is physically plausible, with the meshes of hands and object."""
 
 from dataclasses import dataclass
 
@@ -26,28 +26,25 @@ LARGEST_PENETRATION_M = 0.009
 LARGEST_DISTANCE_M = 0.02
 _JOINT_TOUCH_M = 0.014
 _IDLE_M = 0.2
-# In clips that say by hand when it holds (``firm``), an idle hand may be near: its joints keep out of the 2 cm within
-# which a hand counts as acting, acting joints stay above the table, and two hands keep their joints apart.
+# In clips with ``contact_by_side``, an idle hand may be close, but its joints keep out of the 2 cm within which a hand
+# is active. Joints of active hands stay above the table, and joints of the two hands stay apart.
 _NEAR_IDLE_M, _TABLE_M, _HANDS_APART_M = 0.028, 0.0, 0.012
 _SAME_M = 1e-5
-# A hand without a vertex nearer than this counts as away (infinite distance).
+# A hand without a vertex closer than this has an infinite distance.
 _REACH_M = 0.008
 
 
 @dataclass(frozen=True)
 class Soundness:
-    """Of one action at 30 fps. residual: (held frame,) N and N m. distance_m: (held frame,) of the farther acting hand,
-    0 inside the object; where each hand has its own time, (its frame,) of every hand. penetration_m: (frame,) over all
-    frames. joint_m: as distance_m, nearest joint. idle_m: smallest distance of a present idle hand's joints to the
-    object's vertices. least_idle_m: what it must be. clear: hands stay off the table and off each other."""
+    """Measures of one action at 30 fps. "Grasp frames" are the lifted frames, or each hand's ``contact_by_side``."""
 
-    residual: np.ndarray
-    distance_m: np.ndarray
-    penetration_m: np.ndarray
-    joint_m: np.ndarray
-    idle_m: float
-    least_idle_m: float = _IDLE_M
-    clear: bool = True
+    residual: np.ndarray  # (lifted frame,) unexplained wrench, N and N m
+    distance_m: np.ndarray  # (grasp frame,) distance of the farther active hand, 0 inside the object
+    penetration_m: np.ndarray  # (frame,) depth, in all frames
+    joint_m: np.ndarray  # (grasp frame,) distance of the closest joint of the farther hand
+    idle_m: float  # smallest distance of an idle hand's joints to the object's vertices
+    least_idle_m: float = _IDLE_M  # minimum of ``idle_m``
+    clear: bool = True  # whether hands keep clear of the table and of each other
 
     @property
     def is_sound(self) -> bool:
@@ -63,65 +60,84 @@ class Soundness:
 
 
 def measure(truth: TruthSequence, pair: HandPair, hand_shift_m: np.ndarray | None = None) -> Soundness:
-    """Everything the corpus promises, on the truth at 30 fps.
+    """Measure an action at 30 fps.
 
-    hand_shift_m: (3,) moves all acting hands in the world, for the control that must fail.
+    Args:
+        truth: the action.
+        pair: hand models.
+        hand_shift_m: (3,) world translation of the active hands, for the negative control.
     """
     truth = truth.at_30_fps()
-    held = np.flatnonzero(truth.held)
+    lifted = np.flatnonzero(truth.lifted)
     near: dict[Side, SignedDistance] = {
-        side: _distances(truth, side, pair, hand_shift_m) for side in truth.acting_sides
+        side: _distances(truth, side, pair, hand_shift_m) for side in truth.active_sides
     }
     penetration = np.max([-one.distance_m.min(1) for one in near.values()], axis=0).clip(0)
     distances: dict[Side, np.ndarray] = {side: one.distance_m.min(1) for side, one in near.items()}
     joints: dict[Side, np.ndarray] = {
         side: _joint_distance(truth, side, pair, one, hand_shift_m) for side, one in near.items()
     }
-    residual = _residuals(truth, near, pair, held)
-    if truth.firm:
-        distance, joint = _while_firm(truth, distances), _while_firm(truth, joints)
+    residual = _residuals(truth, near, pair, lifted)
+    if truth.contact_by_side:
+        distance, joint = _during_contact(truth, distances), _during_contact(truth, joints)
         idle, clear = _near_idle(truth, pair), _is_clear(truth, pair)
-        return Soundness(residual, np.maximum(distance, 0), penetration, joint, idle, _NEAR_IDLE_M, clear)
-    distance, joint = (np.max([values[held] for values in both.values()], axis=0) for both in (distances, joints))
-    return Soundness(residual, np.maximum(distance, 0), penetration, joint, _idle(truth, pair))
+        return Soundness(
+            residual=residual,
+            distance_m=np.maximum(distance, 0),
+            penetration_m=penetration,
+            joint_m=joint,
+            idle_m=idle,
+            least_idle_m=_NEAR_IDLE_M,
+            clear=clear,
+        )
+    distance, joint = (
+        np.max([values[lifted] for values in by_side.values()], axis=0) for by_side in (distances, joints)
+    )
+    return Soundness(
+        residual=residual,
+        distance_m=np.maximum(distance, 0),
+        penetration_m=penetration,
+        joint_m=joint,
+        idle_m=_idle(truth, pair),
+    )
 
 
-def _while_firm(truth: TruthSequence, values: dict[Side, np.ndarray]) -> np.ndarray:
-    """The values (frame,) of every hand in the frames in which it holds, one after the other."""
-    return np.concatenate([values[side][start:stop] for side, (start, stop) in truth.firm.items()])
+def _during_contact(truth: TruthSequence, values: dict[Side, np.ndarray]) -> np.ndarray:
+    """Concatenate the values (frame,) of each hand during its contact."""
+    return np.concatenate([values[side][start:stop] for side, (start, stop) in truth.contact_by_side.items()])
 
 
 def _near_idle(truth: TruthSequence, pair: HandPair) -> float:
-    """Distance of idle hands' joints to the object's vertices, metres."""
-    idle: list[Side] = [side for side in SIDES if side not in truth.acting_sides]
+    """Return the distance of an idle hand's joints to the object's vertices, metres."""
+    idle: list[Side] = [side for side in SIDES if side not in truth.active_sides]
     if not idle:
         return np.inf
     return float(vertex_distances_m(truth.object, track_joints(truth.hands[idle[0]], pair[idle[0]])).min())
 
 
 def vertex_distances_m(track: ObjectTrack, points_m: np.ndarray) -> np.ndarray:
-    """(frame, point) from world points (frame, point, 3) to the nearest vertex of the object, metres."""
+    """Return (frame, point) distances of world points (frame, point, 3) to the nearest object vertex, metres."""
     model, local = track.model, track.world_from_object.inverse() @ points_m.astype(np.float64)
-    found = [
+    distances_m = [
         KDTree(model.vertices_m[model.part == part]).query(
             model.object_from_part(part, track.hinge_rad).inverse() @ local
         )[0]
         for part in model.parts
     ]
-    return np.min(found, axis=0)
+    return np.min(distances_m, axis=0)
 
 
 def _is_clear(truth: TruthSequence, pair: HandPair) -> bool:
     joints = {side: track_joints(truth.hands[side], pair[side]) for side in SIDES}
     between = np.linalg.norm(joints["left"][:, :, None] - joints["right"][:, None], axis=-1).min()
-    lowest = min(joints[side][..., 2].min() for side in truth.acting_sides)
+    lowest = min(joints[side][..., 2].min() for side in truth.active_sides)
     return bool(between > _HANDS_APART_M and lowest > _TABLE_M)
 
 
 def residuals_without_contact(truth: TruthSequence) -> np.ndarray:
-    """(held frame,) what is left when no hand touches: the other control."""
+    """Return (lifted frame,) residuals without any contact, for the negative control."""
     truth = truth.at_30_fps()
-    return np.linalg.norm(_wrench(truth)[0][truth.held], axis=1)
+    return np.linalg.norm(_wrench(truth)[0][truth.lifted], axis=1)
 
 
 def _wrench(truth: TruthSequence):
@@ -130,14 +146,16 @@ def _wrench(truth: TruthSequence):
     return required_wrench(motion, FPS, GRAVITY), motion
 
 
-def _residuals(truth: TruthSequence, near: dict[Side, SignedDistance], pair: HandPair, held: np.ndarray) -> np.ndarray:
+def _residuals(
+    truth: TruthSequence, near: dict[Side, SignedDistance], pair: HandPair, lifted: np.ndarray
+) -> np.ndarray:
     wrench, motion = _wrench(truth)
     patches = {side: hand_patches(pair[side]) for side in near}
-    residual = np.empty(len(held))
-    for row, frame in enumerate(held):
+    residual = np.empty(len(lifted))
+    for index, frame in enumerate(lifted):
         contacts = [patch_contacts(one, patches[side], frame) for side, one in near.items()]
         points, normals = _in_world(truth, frame, contacts)
-        residual[row] = force_residual(points, normals, motion.centre_m[frame], wrench[frame])
+        residual[index] = force_residual(points, normals, motion.centre_m[frame], wrench[frame])
     return residual
 
 
@@ -154,7 +172,7 @@ def _object_points(truth: TruthSequence, points_m: np.ndarray, shift_m: np.ndarr
 
 
 def _distances(truth: TruthSequence, side: Side, pair: HandPair, shift_m: np.ndarray | None) -> SignedDistance:
-    """Of the hand's vertices, computed once for frames in which hand and object stand to each other the same way."""
+    """Return signed distances of the hand's vertices, computed once for frames with equal relative pose."""
     points = _object_points(truth, track_vertices(truth.hands[side], pair[side]), shift_m)
     hinge = truth.object.hinge_rad
     angle = np.zeros(len(points)) if hinge is None else hinge
@@ -164,14 +182,14 @@ def _distances(truth: TruthSequence, side: Side, pair: HandPair, shift_m: np.nda
     keys = np.round(np.column_stack([signature, angle]) / _SAME_M)
     changed = np.concatenate([[True], (np.abs(np.diff(keys, axis=0)) > 1).any(1)])
     first = np.flatnonzero(changed)
-    back = np.cumsum(changed) - 1
-    found = surface_index(truth.object.model).nearest(points[first], None if hinge is None else hinge[first])
-    found = found._replace(distance_m=np.where(found.distance_m > _REACH_M, np.inf, found.distance_m))
-    return SignedDistance(*(array[back] for array in found))
+    first_index = np.cumsum(changed) - 1
+    nearest = surface_index(truth.object.model).nearest(points[first], None if hinge is None else hinge[first])
+    nearest = nearest._replace(distance_m=np.where(nearest.distance_m > _REACH_M, np.inf, nearest.distance_m))
+    return SignedDistance(*(array[first_index] for array in nearest))
 
 
 def _joint_distance(truth, side: Side, pair: HandPair, vertices: SignedDistance, shift_m) -> np.ndarray:
-    """(frame,) of the nearest fingertip vertex, or of any joint where no tip is near."""
+    """Return (frame,) distance of the closest fingertip vertex, or of the closest joint if no tip touches."""
     tips = np.abs(vertices.distance_m[:, list(TIP_VERTICES)]).min(1)
     far = np.flatnonzero(tips > _JOINT_TOUCH_M)
     if len(far):
@@ -183,7 +201,7 @@ def _joint_distance(truth, side: Side, pair: HandPair, vertices: SignedDistance,
 
 
 def _idle(truth: TruthSequence, pair: HandPair) -> float:
-    """Distance of idle, present hands: their joints to the ball round the object's vertices."""
+    """Return the distance of an idle hand's joints to the bounding sphere of the object."""
     track = truth.object
     base = track.model.vertices_m
     middle = (base.min(0) + base.max(0)) / 2
@@ -192,7 +210,7 @@ def _idle(truth: TruthSequence, pair: HandPair) -> float:
     nearest = np.inf
     for side in SIDES:
         hand = truth.hands[side]
-        if side in truth.acting_sides or not hand.valid.any():
+        if side in truth.active_sides or not hand.valid.any():
             continue
         gap = np.linalg.norm(track_joints(hand, pair[side]) - centre, axis=2).min() - radius
         nearest = min(nearest, float(gap))

@@ -1,7 +1,7 @@
-"""The objects of the corpus ``study`` and the regions by which each is taken: handle, rim, body, from the top.
+"""The objects of the corpus ``study`` and their grasp regions: handle, rim, body, top.
 
-A region is drawn for the right hand, or for both; left hands use its mirror image, for which every object has a plane
-of symmetry. Names are those of GRAB and ARCTIC, most shapes those of the other corpora.
+A region is defined for the right hand, or for both hands. Left hands use its mirror image, so each object has a plane
+of symmetry. Names are those of GRAB and ARCTIC; most shapes are those of the embedded corpora.
 """
 
 from dataclasses import dataclass, replace
@@ -11,51 +11,51 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import Side
 from hoidata.synthetic.catalogue import HINGE_BEHIND, ObjectSpec, box_at, hinged, object_spec, tilted
-from hoidata.synthetic.grasps import Hold, Reach
+from hoidata.synthetic.grasps import Approach, GraspSpec
 from hoidata.synthetic.shapes import Solid, cylinder, revolved, rounded_box, united
 
 
 @dataclass(frozen=True)
 class Region:
-    """name: in words. hold: by which hands, how. yaw_deg: how the object is turned on the table for it."""
+    """A grasp region of an object."""
 
     name: str
-    hold: Hold
-    yaw_deg: float = 0.0
+    grasp: GraspSpec
+    yaw_deg: float = 0.0  # rotation of the object on the table
 
     def standing(self, spec: ObjectSpec) -> ObjectSpec:
-        """The object as it stands for this region."""
+        """Return the spec of the object, rotated for this region."""
         if not self.yaw_deg:
             return spec
-        turn = Rotation.from_euler("z", self.yaw_deg, degrees=True).as_matrix() @ spec.upright_from_object
-        return replace(spec, standing_deg=tuple(Rotation.from_matrix(turn).as_euler("xyz", degrees=True)))
+        rotation = Rotation.from_euler("z", self.yaw_deg, degrees=True).as_matrix() @ spec.upright_from_object
+        return replace(spec, standing_deg=tuple(Rotation.from_matrix(rotation).as_euler("xyz", degrees=True)))
 
 
 @dataclass(frozen=True)
 class StudyObject:
-    """spec: how it is made. one, two: regions for one hand and for both. lids: regions, by number of hands, from which
-    its lid is moved. across: whether its plane of symmetry lies across (y = 0), as with a handle to the right, or
-    ahead (x = 0)."""
+    """An object and its grasp regions."""
 
     spec: ObjectSpec
-    one: tuple[Region, ...]
-    two: tuple[Region, ...]
-    lids: tuple[tuple[Region, ...], tuple[Region, ...]] = ((), ())
-    across: bool = False
+    one: tuple[Region, ...]  # regions for one hand
+    two: tuple[Region, ...]  # regions for both hands
+    lids: tuple[tuple[Region, ...], tuple[Region, ...]] = ((), ())  # regions to move the lid, with one and two hands
+    across: bool = False  # plane of symmetry: y = 0, as with a handle to the right, or x = 0
 
     def regions(self, verb: str, n_hands: int) -> tuple[Region, ...]:
-        """How ``n_hands`` hands may take it for a verb."""
+        """Return the regions that ``n_hands`` hands can grasp for a verb."""
         return self.lids[n_hands - 1] if verb in ("open", "close") else (self.one, self.two)[n_hands - 1]
 
     def mirror(self, region: Region) -> np.ndarray:
-        """(3, 3) improper rotation of the object's own frame that maps its surface to itself, and the standing object,
-        seen in a mirror with normal x, to the object turned on the table."""
+        """Return the (3, 3) reflection of the object frame that maps the surface to itself.
+
+        It maps the object, mirrored in x, to the object rotated on the table.
+        """
         upright = region.standing(self.spec).upright_from_object
-        turn = Rotation.from_euler("z", (180 if self.across else 0) - 2 * region.yaw_deg, degrees=True).as_matrix()
-        return upright.T @ turn.T @ np.diag([-1.0, 1.0, 1.0]) @ upright
+        rotation = Rotation.from_euler("z", (180 if self.across else 0) - 2 * region.yaw_deg, degrees=True).as_matrix()
+        return upright.T @ rotation.T @ np.diag([-1.0, 1.0, 1.0]) @ upright
 
     def stands_alike(self, right: Region, left: Region) -> bool:
-        """Whether the object stands the same for a right hand at one region and a left hand at (the mirrored) other."""
+        """Whether a right hand at one region and a left hand at the other, mirrored, need the same yaw."""
         return (180 * self.across - left.yaw_deg - right.yaw_deg) % 360 == 0
 
     @property
@@ -64,32 +64,42 @@ class StudyObject:
 
 
 Vector = tuple[float, float, float]
-Reaches = tuple[tuple[Side, Reach], ...]
+Reaches = tuple[tuple[Side, Approach], ...]
 
 
 def _one(name: str, direction: Vector, through: Vector | None, width=0.3, blend=(0.0, 0.8), yaw=0.0) -> Region:
-    return Region(name, Hold((("right", Reach(direction, width, through, blend)),)), yaw)
+    return Region(name, GraspSpec((("right", Approach(direction, width, through, blend)),)), yaw)
 
 
 def _two(name: str, left: tuple, right: tuple, yaw=0.0, width=0.25) -> Region:
-    """left, right: (direction, point aimed at) of each hand."""
-    reaches: Reaches = (
-        ("left", Reach(left[0], width, left[1], (0, 0.7))),
-        ("right", Reach(right[0], width, right[1], (0, 0.7))),
+    """left, right: (direction, target point) of each hand."""
+    approaches: Reaches = (
+        ("left", Approach(left[0], width, left[1], (0, 0.7))),
+        ("right", Approach(right[0], width, right[1], (0, 0.7))),
     )
-    return Region(name, Hold(reaches), yaw)
+    return Region(name, GraspSpec(approaches), yaw)
 
 
 def _lid(name: str, direction: Vector) -> Region:
-    return Region(name, Hold((("right", Reach(direction, 0.4, None, (0, 0.9), 1)),), ANGLES[0], ANGLES))
+    return Region(
+        name,
+        GraspSpec(
+            (("right", Approach(direction=direction, width=0.4, through_m=None, blend=(0, 0.9), part=1)),),
+            ANGLES[0],
+            ANGLES,
+        ),
+    )
 
 
 def _base_and_lid(name: str, base: Vector, lid: Vector) -> Region:
-    reaches: Reaches = (("left", Reach(base, 0.45, None, (0, 0.8), 0)), ("right", Reach(lid, 0.45, None, (0, 0.8), 1)))
-    return Region(name, Hold(reaches, ANGLES[0], ANGLES))
+    approaches: Reaches = (
+        ("left", Approach(direction=base, width=0.45, through_m=None, blend=(0, 0.8), part=0)),
+        ("right", Approach(direction=lid, width=0.45, through_m=None, blend=(0, 0.8), part=1)),
+    )
+    return Region(name, GraspSpec(approaches, ANGLES[0], ANGLES))
 
 
-# Hinge angles at which a hand on a lid, or beside an open one, must be able to hold: while opening, from first to last.
+# Hinge angles, from closed to open, at which a grasp of the lid must be stable.
 ANGLES = (0.4, 0.65, 0.9)
 
 
@@ -107,7 +117,7 @@ def _flashlight() -> Solid:
 
 
 def _waffle_iron_half(height_m: float, at_m: float) -> Solid:
-    """A round half with its half of the handle in front."""
+    """Half of a round waffle iron, with half of the handle at the front."""
     plate, grip = cylinder(0.07, height_m), rounded_box((0.024, 0.1, 0.016)).moved((0, -0.11, 0))
     return united(plate, grip).moved((0, -0.072, at_m))
 
@@ -202,17 +212,26 @@ GRAB_STUDY = (
 
 _BOX = hinged("box", "box", 0.1, 0.07, 0.07, 0.035)
 _WAFFLE_IRON = ObjectSpec(
-    "waffleiron", "waffle iron", _waffle_iron_base, lambda: _waffle_iron_half(0.026, 0.0135), 0.0, HINGE_BEHIND
+    name="waffleiron",
+    words="waffle iron",
+    base=_waffle_iron_base,
+    lid=lambda: _waffle_iron_half(0.026, 0.0135),
+    stand_m=0.0,
+    standing_deg=HINGE_BEHIND,
 )
 _CAPSULE_MACHINE = ObjectSpec(
-    "capsulemachine", "capsule machine", box_at((0.07, 0.11, 0.14), (0, -0.055, -0.0705), 0.004, 0.015),
-    box_at((0.066, 0.1, 0.025), (0, -0.05, 0.013)), 0.0, HINGE_BEHIND,
-)  # fmt: skip
+    name="capsulemachine",
+    words="capsule machine",
+    base=box_at((0.07, 0.11, 0.14), (0, -0.055, -0.0705), 0.004, 0.015),
+    lid=box_at((0.066, 0.1, 0.025), (0, -0.05, 0.013)),
+    stand_m=0.0,
+    standing_deg=HINGE_BEHIND,
+)
 _PARTS = ((-1.0, -0.3, 0.0), (1.0, -0.4, 0.4))
 
 
 def _hinged_object(spec: ObjectSpec, *more: Region) -> StudyObject:
-    """Carried shut, by its side, from the top, or by both hands; opened and closed by lid, or by base and lid."""
+    """Return an object with regions to carry it closed, and regions to move its lid."""
     return StudyObject(
         spec,
         (_one("side", _LOW, None), _one("top", _ABOVE, None, blend=(0.2, 1.0)), *more),

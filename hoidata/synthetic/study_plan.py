@@ -1,7 +1,7 @@
-"""What happens in the corpus ``study``: verbs crossed with objects, hands and regions, over disjoint subjects.
+"""Plan of the corpus ``study``: verbs crossed with objects, hands and regions, over disjoint subjects.
 
-Other than in the embedded corpora, neither object nor hand tells the verb, and verb, object and hand do not tell the
-region: only the sentence tells the verb, and nothing but the motion the region.
+In contrast to the embedded corpora, object and hand do not determine the verb. Verb, object and hand do not determine
+the grasped region.
 """
 
 from collections import Counter
@@ -22,15 +22,13 @@ _UP = (0.0, 0.0, 0.17)
 
 @dataclass(frozen=True)
 class StudyVerb:
-    """intent: as GRAB files it. length: mean frames (30 fps) of firm contact. motion: of the object, hinge angles as
-    shares of the way; two_hands: where two hands do it otherwise. heading_deg: how far the path may be turned about up.
-    """
+    """A verb and its object motion."""
 
-    intent: str
-    length: float
-    motion: Motion
-    two_hands: Motion | None = None
-    heading_deg: float = 0.0
+    intent: str  # as in the files of GRAB
+    length: float  # mean frames of contact at 30 fps
+    motion: Motion  # hinge values are fractions of the range
+    two_hands: Motion | None = None  # motion with both hands, if different
+    heading_deg: float = 0.0  # maximum rotation of the path about the vertical
 
     def motion_of(self, hand: HandType) -> Motion:
         return self.two_hands if hand == "both" and self.two_hands is not None else self.motion
@@ -41,18 +39,18 @@ def _there_and_back(*middle: Key, swing: Swing | None = None) -> Motion:
 
 
 def _turned(degrees: float) -> Motion:
-    return Motion((Key(0), Key(0.15), Key(0.85, turn=(0, 0, degrees)), Key(1, turn=(0, 0, degrees))))
+    return Motion((Key(0), Key(0.15), Key(0.85, rotation_deg=(0, 0, degrees)), Key(1, rotation_deg=(0, 0, degrees))))
 
 
 def _moving_lid(start: float, stop: float) -> tuple[Motion, Motion]:
-    """On the table, and held up between two hands."""
+    """Return the motions on the table, and lifted between two hands."""
     up = (0.0, 0.0, 0.09)
     on_table = (Key(0, hinge=start), Key(0.15, hinge=start), Key(0.85, hinge=stop), Key(1, hinge=stop))
-    held = (
+    lifted = (
         Key(0, hinge=start), Key(0.1, hinge=start), Key(0.3, up, hinge=start), Key(0.72, up, hinge=stop),
         Key(0.95, hinge=stop), Key(1, hinge=stop),
     )  # fmt: skip
-    return Motion(on_table), Motion(held)
+    return Motion(on_table), Motion(lifted)
 
 
 _POURED, _DRUNK = Key(0.45, (-0.06, 0.05, 0.2), (0, -80, 0)), Key(0.44, (0, -0.18, 0.26), (42, 0, 0))
@@ -87,7 +85,8 @@ VERBS = {
     "inspect": StudyVerb(
         "inspect", 84,
         _there_and_back(
-            _SHOWN, _SHOWN._replace(phase=0.38, turn=(12, 0, 60)), _SHOWN._replace(phase=0.62, turn=(12, 0, -60)),
+            _SHOWN, _SHOWN._replace(phase=0.38, rotation_deg=(12, 0, 60)),
+            _SHOWN._replace(phase=0.62, rotation_deg=(12, 0, -60)),
             _SHOWN._replace(phase=0.78),
         ),
     ),
@@ -103,10 +102,10 @@ VERBS = {
     "unscrew": StudyVerb("unscrew", 44, _turned(70)),
 }  # fmt: skip
 HANDOVER = "hand over"
-# Which way these turn is part of the verb, for left hands too; and each is the other one backwards.
+# Their sense of rotation is part of the verb, also for left hands. Each is the reverse of the other.
 SCREWING = ("screw", "unscrew")
 
-# Each object's verbs; every hand does them all, and two hands also hand over what has no lid and room for both.
+# The verbs of each object, for all hands. Two hands also hand over objects without a lid, except _TOO_SHORT ones.
 _VERBS_OF = {
     "mug": "lift place push pass pour drink",
     "waterbottle": "unscrew screw pass pour drink shake",
@@ -125,7 +124,7 @@ _VERBS_OF = {
 
 _TOO_SHORT = {"cubelarge"}
 
-# Subjects and their numbers of clips. Test and validation are those of the named splits of both datasets.
+# Subjects and their numbers of clips. Test and validation subjects are those of the named splits of both datasets.
 _SHARES = {
     "grab": {**dict.fromkeys(("s1", "s2", "s3", "s4", "s5", "s8"), 74), "s6": 24, "s7": 24, "s9": 72, "s10": 192},
     "arctic": {**dict.fromkeys(("s01", "s02", "s04", "s06", "s08", "s09"), 34), "s07": 24, "s05": 40, "s10": 96},
@@ -137,71 +136,74 @@ _HANDS: tuple[HandType, ...] = ("right", "left", "both")
 
 
 class StudyEntry(NamedTuple):
-    """One clip to make. thing: row of STUDY_OBJECTS. region: which of ``choices``. number: from 1, how many times this
-    subject did this verb with this object."""
+    """One clip of the plan."""
 
     subject: str
-    thing: int
+    object_index: int  # in STUDY_OBJECTS
     verb: str
     hand: HandType
-    region: int
-    number: int
+    region: int  # index in ``choices``
+    number: int  # counts the repetitions of verb and object by this subject from 1
 
 
 def shares(dataset: str, size: StudySize) -> dict[str, int]:
-    """The subjects of a corpus and how many clips each makes."""
+    """Return the number of clips of each subject."""
     return (_SHARES if size == "study" else _SMALL_SHARES)[dataset]
 
 
-def verbs_of(thing: StudyObject, hand: HandType) -> list[str]:
-    verbs = _VERBS_OF[thing.spec.name].split()
-    handed_over = hand == "both" and thing.spec.lid is None and thing.spec.name not in _TOO_SHORT
-    return [*verbs, HANDOVER] if handed_over else verbs
+def verbs_of(item: StudyObject, hand: HandType) -> list[str]:
+    verbs = _VERBS_OF[item.spec.name].split()
+    has_handover = hand == "both" and item.spec.lid is None and item.spec.name not in _TOO_SHORT
+    return [*verbs, HANDOVER] if has_handover else verbs
 
 
-def choices(thing: StudyObject, verb: str, hand: HandType) -> list[tuple[Region, ...]]:
-    """The ways to do it: one region, or for handing over that of the right hand and that of the left after it."""
+def choices(item: StudyObject, verb: str, hand: HandType) -> list[tuple[Region, ...]]:
+    """Return the choices of regions: one region, or for "hand over" the regions of the right and of the left hand."""
     if verb != HANDOVER:
-        return [(region,) for region in thing.regions(verb, 2 if hand == "both" else 1)]
-    return [(a, b) for a in thing.one for b in thing.one if a != b and thing.stands_alike(a, b)]
+        return [(region,) for region in item.regions(verb, 2 if hand == "both" else 1)]
+    return [(a, b) for a in item.one for b in item.one if a != b and item.stands_alike(a, b)]
 
 
 def study_plan(dataset: str, size: StudySize) -> list[StudyEntry]:
-    """All clips in order. Each round does every verb with every object and hand once, in a new order, by the next of
-    its regions; subjects take turns."""
+    """Plan all clips. A round has each verb with each object and hand once, in random order, with the next region.
+
+    Subjects alternate.
+    """
     amounts = shares(dataset, size)
-    known = [name for name in amounts if name not in _NOT_TRAINED_ON]
+    training_subjects = [name for name in amounts if name not in _NOT_TRAINED_ON]
     entries: list[StudyEntry] = []
-    for part, names in enumerate((known, *([name] for name in amounts if name in _NOT_TRAINED_ON))):
-        order = _subjects_in_turn({name: amounts[name] for name in names})
+    for part, names in enumerate((training_subjects, *([name] for name in amounts if name in _NOT_TRAINED_ON))):
+        order = _alternating_subjects({name: amounts[name] for name in names})
         entries += _numbered(zip(order, _rounds(dataset, size, part), strict=False))
     return entries
 
 
 def _rounds(dataset: str, size: StudySize, part: int) -> Iterator[tuple[int, str, HandType, int]]:
-    """(object, verb, hand, region) without end."""
-    things = STUDY_OBJECTS[dataset][: _SMALL_OBJECTS if size == "study-small" else None]
+    """Yield (object index, verb, hand, region) without end."""
+    objects = STUDY_OBJECTS[dataset][: _SMALL_OBJECTS if size == "study-small" else None]
     actions = [
-        (row, verb, hand) for row, thing in enumerate(things) for hand in _HANDS for verb in verbs_of(thing, hand)
+        (number, verb, hand) for number, item in enumerate(objects) for hand in _HANDS for verb in verbs_of(item, hand)
     ]
     rng = np.random.default_rng([part, DATASET_IDS[dataset]])
     first = rng.integers(1000, size=len(actions))
     done = 0
     while True:
         for index in rng.permutation(len(actions)):
-            row, verb, hand = actions[index]
-            yield row, verb, hand, int(first[index] + done) % len(choices(things[row], verb, hand))
+            number, verb, hand = actions[index]
+            yield number, verb, hand, int(first[index] + done) % len(choices(objects[number], verb, hand))
         done += 1
 
 
-def _subjects_in_turn(amounts: dict[str, int]) -> list[str]:
-    """Every name as often as its amount says, spread evenly."""
-    places = [((turn + 0.5) / count, name) for name, count in amounts.items() for turn in range(count)]
-    return [name for _, name in sorted(places)]
+def _alternating_subjects(amounts: dict[str, int]) -> list[str]:
+    """Repeat each name as often as its amount, evenly distributed."""
+    positions = [((repetition + 0.5) / count, name) for name, count in amounts.items() for repetition in range(count)]
+    return [name for _, name in sorted(positions)]
 
 
 def _numbered(pairs) -> Iterator[StudyEntry]:
     done: Counter[tuple] = Counter()
-    for subject, (thing, verb, hand, region) in pairs:
-        done[subject, thing, verb] += 1
-        yield StudyEntry(subject, thing, verb, hand, region, done[subject, thing, verb])
+    for subject, (index, verb, hand, region) in pairs:
+        done[subject, index, verb] += 1
+        yield StudyEntry(
+            subject=subject, object_index=index, verb=verb, hand=hand, region=region, number=done[subject, index, verb]
+        )

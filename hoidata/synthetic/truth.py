@@ -1,4 +1,4 @@
-"""What a synthetic action truly is, before any writer turns it into a dataset's own files."""
+"""Ground truth of a synthetic action, from which the writers produce the files of a dataset."""
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -13,38 +13,30 @@ GRAVITY = np.array([0.0, 0.0, -1.0])
 
 @dataclass(frozen=True)
 class TruthSequence:
-    """One action with its approach and retreat, at the source's own frame rate, world frame (z up), metres, radians.
-
-    dataset, subject: as in the source. source_key: the raw sequence it lies in (H2O "subject1/h1/0", GRAB
-    "s1/mug_drink_1", ARCTIC "s01/box_use_01"). raw_start: its first frame there. source_fps: 30, or 120 for GRAB.
-    verb, object_words: in words. object_name: the source's name. hand_type: the hands that touch.
-    hands: both sides; ``valid`` is False where the source says the hand is absent. object: pose and hinge.
-    clip: first frame and one past the last of the labelled interval. contact: the same for the firm grasp.
-    held: (frame,) the object is more than 1.5 cm above its rest. stand_m: height of the stand it rests on.
-    firm: by side ``contact`` of that hand alone; empty where the acting hands hold together, and nobody else is near.
-    """
+    """One action with approach and retreat, at the frame rate of the source; world frame (z up), metres, radians."""
 
     dataset: str
-    subject: str
-    source_key: str
-    raw_start: int
-    source_fps: int
+    subject: str  # as in the source
+    source_key: str  # raw sequence: H2O "subject1/h1/0", GRAB "s1/mug_drink_1", ARCTIC "s01/box_use_01"
+    raw_start: int  # first frame in the raw sequence
+    source_fps: int  # 30, or 120 for GRAB
     verb: str
-    object_name: str
-    object_words: str
+    object_name: str  # as in the source
+    object_words: str  # noun in sentences
     intent: str
-    hand_type: HandType
-    hands: dict[Side, HandTrack]
+    hand_type: HandType  # the hands that touch the object
+    hands: dict[Side, HandTrack]  # both sides; ``valid`` is False if the source marks the hand as absent
     object: ObjectTrack
-    clip: tuple[int, int]
-    contact: tuple[int, int]
-    held: np.ndarray
-    stand_m: float
-    firm: dict[Side, tuple[int, int]] = field(default_factory=dict)
+    clip: tuple[int, int]  # first frame and one past the last of the labelled interval
+    contact: tuple[int, int]  # the same of the grasp
+    lifted: np.ndarray  # (frame,) bool: the object is more than 1.5 cm above its rest
+    stand_m: float  # height of the stand that it rests on
+    # ``contact`` of each hand; empty if the active hands grasp together and the other hand stays away
+    contact_by_side: dict[Side, tuple[int, int]] = field(default_factory=dict)
 
     @property
     def n_frames(self) -> int:
-        return len(self.held)
+        return len(self.lifted)
 
     @property
     def stride(self) -> int:
@@ -53,7 +45,7 @@ class TruthSequence:
 
     @property
     def clip_frames(self) -> np.ndarray:
-        """Own frame numbers of the clip at 30 fps: those whose raw frame number the stride divides."""
+        """Frame numbers of the clip at 30 fps: those whose raw frame number is a multiple of the stride."""
         frames = np.arange(*self.clip)
         return frames[(frames + self.raw_start) % self.stride == 0]
 
@@ -63,37 +55,37 @@ class TruthSequence:
         return self.clip_frames + self.raw_start
 
     @property
-    def acting_sides(self) -> tuple[Side, ...]:
+    def active_sides(self) -> tuple[Side, ...]:
         return tuple(side for side in SIDES if self.hand_type in (side, "both"))
 
-    def holding(self) -> list[tuple[int, int, tuple[Side, ...]]]:
-        """The contact in pieces during which the same hands hold: first frame, one past the last, and the hands."""
-        firm = self.firm or dict.fromkeys(self.acting_sides, self.contact)
-        cuts = sorted({frame for span in firm.values() for frame in span})
+    def contact_intervals(self) -> list[tuple[int, int, tuple[Side, ...]]]:
+        """Divide the contact into intervals with the same hands: first frame, one past the last, and the hands."""
+        spans = self.contact_by_side or dict.fromkeys(self.active_sides, self.contact)
+        cuts = sorted({frame for span in spans.values() for frame in span})
         return [
-            (start, stop, tuple(side for side in SIDES if side in firm and firm[side][0] <= start < firm[side][1]))
+            (start, stop, tuple(side for side in SIDES if side in spans and spans[side][0] <= start < spans[side][1]))
             for start, stop in pairwise(cuts)
         ]
 
     def at_30_fps(self) -> "TruthSequence":
-        """The whole action, approach and retreat included, every ``stride``-th raw frame."""
+        """Return the whole action, with approach and retreat, at every ``stride``-th raw frame."""
         frames = np.arange(self.n_frames)
         return self.take(frames[(frames + self.raw_start) % self.stride == 0])
 
     def take(self, frames: np.ndarray) -> "TruthSequence":
-        """Only the given own frames; ``clip`` and ``contact`` then span what is left of them."""
+        """Select frames; ``clip`` and ``contact`` become their intervals among the selected frames."""
         return replace(
             self,
             hands={side: hand.take(frames) for side, hand in self.hands.items()},
             object=self.object.take(frames),
-            held=self.held[frames],
+            lifted=self.lifted[frames],
             clip=_span(frames, self.clip),
             contact=_span(frames, self.contact),
-            firm={side: _span(frames, span) for side, span in self.firm.items()},
+            contact_by_side={side: _span(frames, span) for side, span in self.contact_by_side.items()},
         )
 
     def joints(self, pair: HandPair) -> dict[Side, np.ndarray]:
-        """(frame, 21, 3) world joints of both hands at every frame of this sequence."""
+        """Return (frame, 21, 3) world joints of both hands."""
         return {side: track_joints(self.hands[side], pair[side]) for side in SIDES}
 
 

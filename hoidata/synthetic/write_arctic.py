@@ -1,7 +1,7 @@
-"""Truth sequences as ARCTIC's own files: hands and objects as npy, objects in millimetres, descriptions of Text2HOI.
+"""Writes ground truth in ARCTIC's format: hands and objects as npy, objects in millimetres, labels of Text2HOI.
 
-Formats: raw-formats.md section 3. Finger poses are filed relative to the hand model's mean pose; MANO translations are
-of the "add" kind; parts.json says 0 for the top, the part that moves, and 1 for the bottom.
+Finger poses are relative to the mean pose of the hand model. MANO translations are added to the wrist of the rest mesh.
+In parts.json 0 is the top, the part that moves, and 1 the bottom.
 """
 
 import json
@@ -22,7 +22,7 @@ _SPLIT_OF = {"s05": "val", "s10": "test"}
 
 
 def write_arctic_meta(root: Path, sequences: list[TruthSequence], specs: tuple[ObjectSpec, ...]) -> None:
-    """meta/ and splits_json/: object templates in mm, parts, key points, subjects, protocols."""
+    """Write meta/ and splits_json/: object templates in mm, parts, key points, subjects, protocols."""
     meta = {}
     for spec in specs:
         model = model_of(spec)
@@ -32,10 +32,10 @@ def write_arctic_meta(root: Path, sequences: list[TruthSequence], specs: tuple[O
         write_text(folder / "parts.json", json.dumps((1 - model.part.astype(int)).tolist()))
         parameters = {}
         for name, part in (("top", 1), ("bottom", 0)):
-            own = vertices[model.part == part]
-            points = own[np.linspace(0, len(own) - 1, 300).astype(int)]
+            part_vertices = vertices[model.part == part]
+            points = part_vertices[np.linspace(0, len(part_vertices) - 1, 300).astype(int)]
             write_text(folder / f"{name}_keypoints_300.json", json.dumps({"keypoints": points.tolist()}))
-            parameters |= _part_parameters(name, own)
+            parameters |= _part_parameters(name, part_vertices)
         write_text(folder / "object_params.json", json.dumps(parameters))
         diameter = np.linalg.norm(model.vertices_m.max(0) - model.vertices_m.min(0))
         meta[spec.name] = {"diameter": float(diameter)}
@@ -76,13 +76,13 @@ def _write_protocols(root: Path, sequences: list[TruthSequence]) -> None:
 
 
 def write_arctic_sequence(root: Path, members: list[TruthSequence], pair: HandPair) -> None:
-    """raw_seqs/<key>.{mano,object}.npy and description/<key>/description.txt of one raw sequence."""
+    """Write raw_seqs/<key>.{mano,object}.npy and description/<key>/description.txt of one raw sequence."""
     key = members[0].source_key
     n_frames = members[-1].raw_start + members[-1].n_frames + GAP_FRAMES
-    taken = np.concatenate([np.arange(truth.raw_start, truth.raw_start + truth.n_frames) for truth in members])
-    source = taken[np.abs(taken[:, None] - np.arange(n_frames)).argmin(0)]
+    action_frames = np.concatenate([np.arange(truth.raw_start, truth.raw_start + truth.n_frames) for truth in members])
+    source = action_frames[np.abs(action_frames[:, None] - np.arange(n_frames)).argmin(0)]
     # Frames between actions repeat the nearest one that belongs to an action.
-    order = np.searchsorted(taken, source)
+    order = np.searchsorted(action_frames, source)
     hands = {side: _hand(members, side, pair, order) for side in reversed(SIDES)}
     write_npy(root / "raw_seqs" / f"{key}.mano.npy", hands)
     write_npy(root / "raw_seqs" / f"{key}.object.npy", _object(members)[order])
@@ -112,7 +112,7 @@ def _hand(members: list[TruthSequence], side: Side, pair: HandPair, order: np.nd
 
 
 def _object(members: list[TruthSequence]) -> np.ndarray:
-    """(frame, 7) float32: hinge angle, rotation, translation in mm."""
+    """Return (frame, 7) float32: hinge angle, rotation, translation in mm."""
     rows = []
     for truth in members:
         track = truth.object

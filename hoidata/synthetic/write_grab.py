@@ -1,7 +1,7 @@
-"""Truth sequences as GRAB's own files: one npz per sequence at 120 Hz, every member a 0-d array.
+"""Writes ground truth in GRAB's format: one npz per sequence at 120 Hz, all members 0-d arrays.
 
-Formats: raw-formats.md section 2. Objects and the table follow the row-vector convention (``x_world = x R + t``), so
-the filed axis-angle is that of the transpose. Hands: personal rest mesh, betas 0, MANO translation of the "add" kind.
+Objects and the table follow the row-vector convention (``x_world = x R + t``), so the stored axis-angle is that of the
+transpose. Hands have a personal rest mesh and betas 0; MANO translations are added to the wrist of the rest mesh.
 """
 
 from pathlib import Path
@@ -31,7 +31,7 @@ _TABLE_M = (0.9, 0.8, 0.03)
 
 
 def write_grab_meshes(root: Path, sequences: list[TruthSequence], specs: tuple[ObjectSpec, ...]) -> None:
-    """Object meshes, the table, and each subject's personal hands, metres."""
+    """Write object meshes, the table, and the personal hands of each subject, metres."""
     for spec in specs:
         model = model_of(spec)
         write_ply(root / _MESHES / f"{spec.name}.ply", model.vertices_m, model.faces)
@@ -59,7 +59,7 @@ def _template_path(subject: str, side: Side) -> str:
 
 
 def write_grab_sequence(root: Path, members: list[TruthSequence], pair: HandPair) -> None:
-    """grab/<subject>/<object>_<intent>_<n>.npz; a recording of GRAB is one action."""
+    """Write grab/<subject>/<object>_<intent>_<n>.npz. A recording of GRAB is one action."""
     (truth,) = members
     body = {
         "params": _body(truth.n_frames),
@@ -90,13 +90,13 @@ def write_grab_sequence(root: Path, members: list[TruthSequence], pair: HandPair
 
 
 def _body(n_frames: int) -> dict[str, np.ndarray]:
-    """A standing SMPL-X body that nobody looks at."""
+    """Return an unused SMPL-X body in its rest pose."""
     return {name: np.zeros((n_frames, width), dtype=np.float32) for name, width in _BODY_PARAMETERS.items()}
 
 
 def _hand_parameters(track: HandTrack, pair: HandPair, side: Side) -> dict[str, np.ndarray]:
     rest_wrist = pair[side].rest_joints_m(np.zeros((1, 10)), track.template_m)[0, 0]
-    # The components are orthonormal, so the projection is the nearest pose 24 of them can express.
+    # The components are orthonormal, so the projection onto 24 components is the closest pose.
     projected = track.hand_pose @ pair[side].components[:_COMPONENTS].T
     parameters = {
         "global_orient": track.global_orient,
@@ -113,24 +113,24 @@ def _object_parameters(truth: TruthSequence) -> dict[str, np.ndarray]:
 
 
 def _table_parameters(truth: TruthSequence) -> dict[str, np.ndarray]:
-    """The table top lies at height 0; objects that need room below stand on a slim stand, which GRAB does not file."""
+    """The table top is at height 0. Stands below objects are not part of the format."""
     zeros = np.zeros((truth.n_frames, 3), dtype=np.float32)
     return {"transl": zeros, "global_orient": zeros.copy()}
 
 
 def _object_contact(truth: TruthSequence, pair: HandPair) -> np.ndarray:
-    """(frame, object vertex) int8 ids of the hand segments that touch; 0 but for the frames of firm contact.
+    """Return (frame, object vertex) int8 ids of the touching hand segments; 0 outside of the contact.
 
-    While the same hands hold, they and the object do not move against each other, so one frame says it for all.
+    While the same hands grasp, they do not move relative to the object, so the labels are computed in one frame.
     """
     contact = np.zeros((truth.n_frames, len(truth.object.model.vertices_m)), dtype=np.int8)
-    for start, stop, sides in truth.holding():
+    for start, stop, sides in truth.contact_intervals():
         contact[start:stop] = _labels(truth, (start + stop) // 2, sides, pair)
     return contact
 
 
 def _labels(truth: TruthSequence, frame: int, sides: tuple[Side, ...], pair: HandPair) -> np.ndarray:
-    """(object vertex,) int8 ids in one frame."""
+    """Return (object vertex,) int8 ids in one frame."""
     labels = np.zeros(len(truth.object.model.vertices_m), dtype=np.int8)
     nearest = np.full(len(labels), np.inf)
     one = truth.take(np.array([frame]))
@@ -140,8 +140,8 @@ def _labels(truth: TruthSequence, frame: int, sides: tuple[Side, ...], pair: Han
         distance, index = KDTree(local).query(truth.object.model.vertices_m)
         joint = pair[side].skin_weights.argmax(1)[index]
         ids = np.where(joint == 0, _HAND_ID[side], _FINGER_ID[side] + joint - 1)
-        # A coarse mesh may have no vertex under the fingers: its nearest one is marked all the same.
+        # A coarse mesh may have no vertex under the fingers, so the nearest vertex always touches.
         touching = distance <= max(_TOUCH_M, distance.min())
-        nearer = touching & (distance < nearest)
-        labels[nearer], nearest[nearer] = ids[nearer], distance[nearer]
+        is_nearest = touching & (distance < nearest)
+        labels[is_nearest], nearest[is_nearest] = ids[is_nearest], distance[is_nearest]
     return labels

@@ -1,7 +1,7 @@
-"""Truth sequences as H2O's own tree: per-frame text files in the frame of a moving head camera.
+"""Writes ground truth in H2O's format: per-frame text files in the frame of a moving head camera.
 
-Formats: raw-formats.md section 1. MANO translations are of the "add" kind: wrist = J0(betas) + translation, and the
-turn about J0 stays, so in the camera frame ``t' = A (J0 + t) + b - J0``.
+MANO translations are added to the wrist of the rest mesh: wrist = J0(betas) + translation. The hand rotates about J0,
+so in the camera frame ``t' = A (J0 + t) + b - J0``.
 """
 
 from itertools import product
@@ -26,9 +26,9 @@ _SPLITS = {"subject1": "train", "subject2": "val", "subject3": "test"}
 
 
 def write_h2o_objects_and_lists(root: Path, sequences: list[TruthSequence], specs: tuple[ObjectSpec, ...]) -> None:
-    """object/<name>/<name>.obj, metres, and label_split/action_*.txt: labelled runs of each split.
+    """Write object/<name>/<name>.obj, metres, and label_split/action_*.txt: the labelled intervals of each split.
 
-    The test list carries no labels, as in the original.
+    The test list has no labels, as in the original.
     """
     for spec in specs:
         model = model_of(spec)
@@ -37,10 +37,10 @@ def write_h2o_objects_and_lists(root: Path, sequences: list[TruthSequence], spec
     for truth in sequences:
         last[truth.source_key] = max(last[truth.source_key], truth.raw_start + truth.n_frames + GAP_FRAMES - 1)
     for split in ("train", "val", "test"):
-        own = [truth for truth in sequences if _SPLITS[truth.subject] == split]
+        members = [truth for truth in sequences if _SPLITS[truth.subject] == split]
         header = "id path action_label start_act end_act start_frame end_frame"
         lines = [header if split != "test" else header.replace(" action_label", "")]
-        for number, truth in enumerate(own, 1):
+        for number, truth in enumerate(members, 1):
             label = "" if split == "test" else f" {H2O_ACTION_IDS[truth.verb, truth.object_name]}"
             start, stop = truth.raw_start + truth.clip[0], truth.raw_start + truth.clip[1] - 1
             lines.append(f"{number} {truth.source_key}{label} {start} {stop} 0 {last[truth.source_key]}")
@@ -48,18 +48,18 @@ def write_h2o_objects_and_lists(root: Path, sequences: list[TruthSequence], spec
 
 
 def write_h2o_sequence(root: Path, members: list[TruthSequence], pair: HandPair) -> None:
-    """All per-frame files of one raw sequence, camera 4: its actions in order, nothing but an empty table between."""
+    """Write the per-frame files of one raw sequence, camera 4: its actions in order, with empty frames between."""
     key = members[0].source_key
     folder = root / key / "cam4"
     write_text(folder / "cam_intrinsics.txt", _line(np.array(_INTRINSICS)))
     n_frames = members[-1].raw_start + members[-1].n_frames + GAP_FRAMES
     cameras = _head_camera(key, n_frames)
-    rows = _empty_rows(n_frames, cameras)
+    lines_of = _empty_lines(n_frames, cameras)
     for truth in members:
-        _fill_rows(rows, truth, cameras, pair)
-    for name, lines in rows.items():
+        _fill_lines(lines_of, truth, cameras, pair)
+    for name, frame_lines in lines_of.items():
         (folder / name).mkdir(parents=True, exist_ok=True)
-        for frame, line in enumerate(lines):
+        for frame, line in enumerate(frame_lines):
             with open(f"{folder}/{name}/{frame:06d}.txt", "w", encoding="ascii") as stream:
                 stream.write(line)
 
@@ -69,7 +69,7 @@ def _line(numbers: np.ndarray) -> str:
 
 
 def _head_camera(key: str, n_frames: int) -> np.ndarray:
-    """(frame, 4, 4) camera-to-world of a head that looks down at the table and sways; OpenCV axes (y down, z ahead)."""
+    """Return (frame, 4, 4) world_from_camera of a swaying head that looks at the table; OpenCV axes (z forward)."""
     phase = np.linspace(0, 1, n_frames)[:, None] * 2 * np.pi
     offset = np.frombuffer(key.encode().ljust(16)[:16], dtype=np.uint8).astype(float)[:3] % 7
     eye = np.array([0.0, -0.45, 0.55]) + 0.03 * np.sin(phase * [1, 2, 3] + offset)
@@ -83,7 +83,7 @@ def _head_camera(key: str, n_frames: int) -> np.ndarray:
     return pose
 
 
-def _empty_rows(n_frames: int, cameras: np.ndarray) -> dict[str, list[str]]:
+def _empty_lines(n_frames: int, cameras: np.ndarray) -> dict[str, list[str]]:
     no_object = np.concatenate([[0.0], np.eye(4).ravel()])
     return {
         "cam_pose": [_line(pose.ravel()) for pose in cameras],
@@ -96,50 +96,54 @@ def _empty_rows(n_frames: int, cameras: np.ndarray) -> dict[str, list[str]]:
     }
 
 
-def _fill_rows(rows: dict[str, list[str]], truth: TruthSequence, cameras: np.ndarray, pair: HandPair) -> None:
+def _fill_lines(lines_of: dict[str, list[str]], truth: TruthSequence, cameras: np.ndarray, pair: HandPair) -> None:
     frames = slice(truth.raw_start, truth.raw_start + truth.n_frames)
     camera = cameras[frames]
     world_to_camera = camera[:, :3, :3].transpose(0, 2, 1)
     eye = camera[:, :3, 3]
     blocks = [_hand_blocks(truth.hands[side], pair, side, world_to_camera, eye) for side in SIDES]
     mano, points = (np.concatenate(kind, axis=1) for kind in zip(*blocks, strict=True))
-    pose, corners = _object_rows(truth, world_to_camera, eye)
+    pose, corners = _object_blocks(truth, world_to_camera, eye)
     table = {"hand_pose": points, "hand_pose_mano": mano, "obj_pose": corners, "obj_pose_rt": pose}
     for name, numbers in table.items():
-        rows[name][frames] = [_line(row) for row in numbers]
+        lines_of[name][frames] = [_line(values) for values in numbers]
     labelled = range(truth.raw_start + truth.clip[0], truth.raw_start + truth.clip[1])
     for frame in labelled:
-        rows["action_label"][frame] = f"{H2O_ACTION_IDS[truth.verb, truth.object_name]}\n"
-        rows["verb_label"][frame] = f"{H2O_VERB_IDS[truth.verb]}\n"
+        lines_of["action_label"][frame] = f"{H2O_ACTION_IDS[truth.verb, truth.object_name]}\n"
+        lines_of["verb_label"][frame] = f"{H2O_VERB_IDS[truth.verb]}\n"
 
 
 def _hand_blocks(
-    track: HandTrack, pair: HandPair, side, turn: np.ndarray, eye: np.ndarray
+    track: HandTrack, pair: HandPair, side, camera_from_world: np.ndarray, eye: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(frame, 62) flag, translation, 48 pose, 10 betas; (frame, 64) flag and 21 points; both in the camera frame."""
+    """Return (frame, 62) flag, translation, 48 pose, 10 betas, and (frame, 64) flag, 21 points; camera frame."""
     n_frames = track.n_frames
     if not track.valid.any():
         return np.tile(_ABSENT_MANO, (n_frames, 1)), np.tile(_ABSENT_POINTS, (n_frames, 1))
     rest_wrist = pair[side].rest_joints_m(track.betas)[0, 0]
-    translation = np.einsum("fij,fj->fi", turn, track.wrist_m - eye) - rest_wrist
-    orient = (Rotation.from_matrix(turn) * Rotation.from_rotvec(track.global_orient)).as_rotvec()
+    translation = np.einsum("fij,fj->fi", camera_from_world, track.wrist_m - eye) - rest_wrist
+    orient = (Rotation.from_matrix(camera_from_world) * Rotation.from_rotvec(track.global_orient)).as_rotvec()
     flag = np.ones((n_frames, 1))
     mano = np.concatenate([flag, translation, orient, track.hand_pose, np.repeat(track.betas, n_frames, 0)], axis=1)
     joints = track_joints(track, pair[side])[:, OPENPOSE].astype(np.float64)
-    seen = (joints - eye[:, None]) @ turn.transpose(0, 2, 1)
-    return mano, np.concatenate([flag, seen.reshape(n_frames, 63)], axis=1)
+    joints_camera_m = (joints - eye[:, None]) @ camera_from_world.transpose(0, 2, 1)
+    return mano, np.concatenate([flag, joints_camera_m.reshape(n_frames, 63)], axis=1)
 
 
-def _object_rows(truth: TruthSequence, turn: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(frame, 17) class id and object-to-camera matrix; (frame, 64) class id, centre, box corners, edge midpoints."""
+def _object_blocks(
+    truth: TruthSequence, camera_from_world: np.ndarray, eye: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (frame, 17) class id, camera_from_object; and (frame, 64) class id, centre, corners, edge midpoints."""
     track, n_frames = truth.object, truth.n_frames
     pose = np.tile(np.eye(4), (n_frames, 1, 1))
-    pose[:, :3, :3] = turn @ Rotation.from_rotvec(track.rotvec).as_matrix()
-    pose[:, :3, 3] = np.einsum("fij,fj->fi", turn, track.translation_m - eye)
+    pose[:, :3, :3] = camera_from_world @ Rotation.from_rotvec(track.rotvec).as_matrix()
+    pose[:, :3, 3] = np.einsum("fij,fj->fi", camera_from_world, track.translation_m - eye)
     low, high = track.model.vertices_m.min(0), track.model.vertices_m.max(0)
     corners = np.array(list(product(*zip(low, high, strict=True))))
     edges = np.array([(corners[a] + corners[b]) / 2 for a, b in _EDGES])
     points = np.concatenate([[(low + high) / 2], corners, edges])
-    seen = points @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3]
+    points_camera_m = points @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3]
     kind = np.full((n_frames, 1), float(H2O_OBJECT_IDS[truth.object_name]))
-    return np.concatenate([kind, pose.reshape(n_frames, 16)], 1), np.concatenate([kind, seen.reshape(n_frames, 63)], 1)
+    return np.concatenate([kind, pose.reshape(n_frames, 16)], 1), np.concatenate(
+        [kind, points_camera_m.reshape(n_frames, 63)], 1
+    )

@@ -17,8 +17,8 @@ from torch import Tensor, nn
 from hoidata.actions.action import (
     Actions,
     action_numbers,
-    beside_usual,
-    is_seen,
+    describe_unusual,
+    is_visible,
     training_actions,
     usual_limits,
     verb_of,
@@ -89,25 +89,25 @@ class VerbCheck:
 
     def moved_as(self, numbers: Mapping[str, float]) -> str | None:
         """The verb whose training clips have the most similar object motion; None if gravity is not known."""
-        return self.actions.named(numbers)
+        return self.actions.nearest_verb(numbers)
 
     def unusual(self, asked: str | None, numbers: Mapping[str, float]) -> tuple[str, ...]:
         """Measures outside the range of the requested verb's training clips, in words."""
         found = () if asked is None else self.actions.unusual(asked, numbers)
         above = {name: most for name, most in self._most(asked).items() if numbers[name] > most}
-        said = (beside_usual(name, numbers[name], 0.0, most) for name, most in above.items())
+        said = (describe_unusual(name, numbers[name], 0.0, most) for name, most in above.items())
         return (*found, *filter(None, said))
 
     def seen(self, asked: str | None, numbers: Mapping[str, float]) -> tuple[str, ...]:
         """Those of ``unusual`` that are large enough to see."""
-        found = () if asked is None else self.actions.seen(asked, numbers)
-        above = {name: most for name, most in self._most(asked).items() if is_seen(name, numbers[name], 0.0, most)}
-        said = (beside_usual(name, numbers[name], 0.0, most) for name, most in above.items())
+        found = () if asked is None else self.actions.visibly_unusual(asked, numbers)
+        above = {name: most for name, most in self._most(asked).items() if is_visible(name, numbers[name], 0.0, most)}
+        said = (describe_unusual(name, numbers[name], 0.0, most) for name, most in above.items())
         return (*found, *filter(None, said))
 
     def beyond(self, asked: str | None, numbers: Mapping[str, float]) -> float:
         """The largest distance of a measure from its range, in widths of the range; 0 if all are inside."""
-        found = [] if asked is None else list(self.actions.beyond(asked, numbers).values())
+        found = [] if asked is None else list(self.actions.violations(asked, numbers).values())
         return max(0.0, *found, *(numbers[name] / most - 1 for name, most in self._most(asked).items()))
 
     def _most(self, asked: str | None) -> dict[str, float]:

@@ -160,12 +160,12 @@ def read_settings(pairs: list[str]) -> dict[str, Any]:
 
 def _hands(choice: str, needs_mano: bool) -> "tuple[HandPair, str]":
     """The hand model to check with, and a note for the table."""
-    from hoidata.store.info import STAND_IN_ERROR
+    from hoidata.store.info import EMBEDDED_HAND_ERROR
 
     hands = chosen_hands(choice)
     note = f"hand: {hands.name}"
     if needs_mano and hands.name == "embedded":
-        note += f"; with files made for MANO, ignore warnings about touch: {STAND_IN_ERROR}"
+        note += f"; with files made for MANO, ignore warnings about touch: {EMBEDDED_HAND_ERROR}"
     return hands, note
 
 

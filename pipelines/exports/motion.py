@@ -154,7 +154,7 @@ def file_name_of(label: str) -> str:
 def _filled_untracked(track: HandTrack, joints_m: np.ndarray) -> tuple[HandTrack, np.ndarray]:
     """A hand and its joints with the last tracked pose in untracked frames; zeros if it is never tracked."""
     if track.valid.any():
-        return track.held(), joints_m[track.shown_frames]
+        return track.with_last_valid_pose(), joints_m[track.last_valid_frames]
     poses = (track.wrist_m, track.global_orient, track.hand_pose)
     wrist_m, global_orient, hand_pose = map(np.zeros_like, poses)
     return replace(track, wrist_m=wrist_m, global_orient=global_orient, hand_pose=hand_pose), 0 * joints_m

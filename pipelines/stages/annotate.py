@@ -19,6 +19,6 @@ def run(paths: StagePaths) -> None:
         load_settings(AnnotationSettings, "annotate"),
         contact=read_contact_settings(paths.contact),
         hands=load_hands(paths.profile),
-        left_out=left_out_reasons(paths.quality),
+        excluded=left_out_reasons(paths.quality),
     )
     print_counts(paths, counts)

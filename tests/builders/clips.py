@@ -31,11 +31,12 @@ def random_hand(n_frames: int, seed: int = 0, betas_rows: int = 1, template_m: n
 
 
 def flat_hand(wrist_m: np.ndarray, valid: np.ndarray | None = None) -> HandTrack:
-    """A hand in its rest pose and shape at (frame, 3) places."""
+    """A hand in its rest pose and shape at (frame, 3) positions."""
     wrist = np.asarray(wrist_m, np.float32)
     zeros, pose = np.zeros_like(wrist), np.zeros((len(wrist), 45), np.float32)
     valid = np.ones(len(wrist), bool) if valid is None else valid
-    return HandTrack(wrist, zeros, pose, np.zeros((1, 10), np.float32), valid)
+    betas = np.zeros((1, 10), np.float32)
+    return HandTrack(wrist_m=wrist, global_orient=zeros, hand_pose=pose, betas=betas, valid=valid)
 
 
 def still_object(model: ObjectModel, n_frames: int, hinge_rad: np.ndarray | None = None) -> ObjectTrack:
@@ -44,9 +45,9 @@ def still_object(model: ObjectModel, n_frames: int, hinge_rad: np.ndarray | None
 
 
 def clip_of(clip_id: str, track: ObjectTrack, hands: dict[Side, HandTrack] | None = None, **facts: Any) -> Clip:
-    """A clip named dataset/subject/sequence, of SYNTHETIC motion; hands lie at the origin if none are given."""
+    """A synthetic clip named dataset/subject/sequence; the hands are at the origin by default."""
     dataset, subject, *_ = clip_id.split("/")
-    made = Clip(
+    clip = Clip(
         clip_id=clip_id,
         dataset=dataset,
         subject=subject,
@@ -59,7 +60,7 @@ def clip_of(clip_id: str, track: ObjectTrack, hands: dict[Side, HandTrack] | Non
         object_words=track.model.name,
         synthetic=True,
     )
-    return replace(made, **facts)
+    return replace(clip, **facts)
 
 
 def build_clip(
@@ -72,10 +73,10 @@ def build_clip(
     verb: str | None = "lift",
     gravity: tuple[float, float, float] | None = (0.0, 0.0, -1.0),
 ) -> Clip:
-    """A small valid clip of an embedded hand that holds a box.
+    """A small valid clip of an embedded hand that grasps a box.
 
-    The box moves along a smooth random path. An acting hand moves with it, its middle fingertip 3 mm above a face;
-    a hand that does not act is valid too, but half a metre away.
+    The box moves along a smooth random path. An active hand moves with it, its middle fingertip 3 mm above a face. An
+    inactive hand is valid, but half a metre away.
     """
     rng = np.random.default_rng(seed)
     time = np.linspace(0, 1, n_frames)[:, None]
@@ -88,18 +89,27 @@ def build_clip(
         translation.astype(np.float32),
         (0.4 * time[:, 0]).astype(np.float32) if articulated else None,
     )
-    fall = None if gravity is None else np.array(gravity)
-    return clip_of(clip_id, track, hands, subject=subject, verb=verb, gravity=fall, object_words="box", synthetic=False)
+    gravity_direction = None if gravity is None else np.array(gravity)
+    return clip_of(
+        clip_id,
+        track,
+        hands,
+        subject=subject,
+        verb=verb,
+        gravity=gravity_direction,
+        object_words="box",
+        synthetic=False,
+    )
 
 
 def _hand(
-    side: Side, acting: bool, rotation: np.ndarray, translation: np.ndarray, rng: np.random.Generator
+    side: Side, is_active: bool, rotation: np.ndarray, translation: np.ndarray, rng: np.random.Generator
 ) -> HandTrack:
     pose, betas = rng.normal(0, 0.1, 45), rng.normal(0, 0.5, (1, 10))
     orient = Rotation.from_euler("y", 90 if side == "left" else -90, degrees=True).as_matrix()
     from_wrist = _middle_tip(side, orient, pose, betas)
-    face = np.array([0.0, 0.0, TOP_M + TIP_GAP_M]) if acting else np.array([0.5, 0.0, 0.5])
-    # Each hand has its own half of the top face.
+    face = np.array([0.0, 0.0, TOP_M + TIP_GAP_M]) if is_active else np.array([0.5, 0.0, 0.5])
+    # Each hand is above one half of the top face.
     face[1] += 0.02 if side == "left" else -0.02
     return HandTrack(
         wrist_m=(rotation @ (face - from_wrist) + translation).astype(np.float32),
@@ -111,8 +121,14 @@ def _hand(
 
 
 def _middle_tip(side: Side, orient: np.ndarray, pose: np.ndarray, betas: np.ndarray) -> np.ndarray:
-    """(3,) from the wrist to the tip of the middle finger."""
-    at_origin = HandTrack(np.zeros((1, 3)), rotmat_to_rotvec(orient)[None], pose[None], betas, np.ones(1, dtype=bool))
+    """Return (3,) from the wrist to the tip of the middle finger."""
+    at_origin = HandTrack(
+        wrist_m=np.zeros((1, 3)),
+        global_orient=rotmat_to_rotvec(orient)[None],
+        hand_pose=pose[None],
+        betas=betas,
+        valid=np.ones(1, dtype=bool),
+    )
     return track_joints(at_origin, load_embedded_hands()[side])[0, 17]
 
 
@@ -125,26 +141,26 @@ def with_object(clip: Clip, **changes: Any) -> Clip:
 
 
 def jumping(clip: Clip, frame: int, metres: float) -> Clip:
-    """The object is elsewhere from one frame on, by so much along each axis."""
-    place = clip.object.translation_m.copy()
-    place[frame:] += metres
-    return with_object(clip, translation_m=place)
+    """Shift the object along each axis, from one frame on."""
+    translation_m = clip.object.translation_m.copy()
+    translation_m[frame:] += metres
+    return with_object(clip, translation_m=translation_m)
 
 
-def in_another_world(clip: Clip, turn: Rotation, shift_m: np.ndarray) -> Clip:
-    """The clip in a world whose points are ``turn(p) + shift_m``; SciPy's formulas, not ours, and the clip's dtypes."""
+def in_another_world(clip: Clip, rotation: Rotation, shift_m: np.ndarray) -> Clip:
+    """The clip in a world with points ``rotation(p) + shift_m``, by SciPy's formulas, in the clip's dtypes."""
 
     def moved(points_m: np.ndarray) -> np.ndarray:
-        return (turn.apply(points_m) + shift_m).astype(points_m.dtype)
+        return (rotation.apply(points_m) + shift_m).astype(points_m.dtype)
 
     def turned(rotvec: np.ndarray) -> np.ndarray:
-        return (turn * Rotation.from_rotvec(rotvec)).as_rotvec().astype(rotvec.dtype)
+        return (rotation * Rotation.from_rotvec(rotvec)).as_rotvec().astype(rotvec.dtype)
 
     def track(old: ObjectTrack) -> ObjectTrack:
         return replace(old, rotvec=turned(old.rotvec), translation_m=moved(old.translation_m))
 
     back = np.eye(4)
-    back[:3, :3], back[:3, 3] = turn.inv().as_matrix(), -turn.inv().apply(shift_m)
+    back[:3, :3], back[:3, 3] = rotation.inv().as_matrix(), -rotation.inv().apply(shift_m)
     camera = clip.camera
     if camera is not None:
         camera = replace(camera, rotvec=turned(camera.rotvec), position_m=moved(camera.position_m))
@@ -157,23 +173,25 @@ def in_another_world(clip: Clip, turn: Rotation, shift_m: np.ndarray) -> Clip:
         hands=hands,
         object=track(clip.object),
         other_objects=tuple(map(track, clip.other_objects)),
-        gravity=None if clip.gravity is None else turn.apply(clip.gravity),
+        gravity=None if clip.gravity is None else rotation.apply(clip.gravity),
         source_from_world=clip.source_from_world @ back,
         camera=camera,
     )
 
 
 def mirror_image(clip: Clip) -> Clip:
-    """The clip in a mirror that turns x: axis-angles keep x and turn y and z, left and right change places."""
-    turn, hands = -MIRROR, {}
+    """Mirror a clip in x: axis-angles negate y and z, and the hands change sides."""
+    rotvec_signs, hands = -MIRROR, {}
     for side, opposite in zip(SIDES, reversed(SIDES), strict=True):
         track = clip.hands[opposite]
-        pose = (track.hand_pose.reshape(-1, 15, 3) * turn).reshape(track.hand_pose.shape)
+        pose = (track.hand_pose.reshape(-1, 15, 3) * rotvec_signs).reshape(track.hand_pose.shape)
         hands[side] = replace(
-            track, wrist_m=track.wrist_m * MIRROR, global_orient=track.global_orient * turn, hand_pose=pose
+            track, wrist_m=track.wrist_m * MIRROR, global_orient=track.global_orient * rotvec_signs, hand_pose=pose
         )
     model, track = clip.object.model, clip.object
-    hinge = model.hinge and Hinge(model.hinge.axis * turn, model.hinge.origin_m * MIRROR)
-    image = ObjectModel("mirrored", model.vertices_m * MIRROR, model.faces[:, ::-1], model.part, hinge)
-    changes = {"rotvec": track.rotvec * turn, "translation_m": track.translation_m * MIRROR}
+    hinge = model.hinge and Hinge(model.hinge.axis * rotvec_signs, model.hinge.origin_m * MIRROR)
+    image = ObjectModel(
+        name="mirrored", vertices_m=model.vertices_m * MIRROR, faces=model.faces[:, ::-1], part=model.part, hinge=hinge
+    )
+    changes = {"rotvec": track.rotvec * rotvec_signs, "translation_m": track.translation_m * MIRROR}
     return with_object(replace(clip, hands=hands), model=image, **changes)

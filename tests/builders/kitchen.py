@@ -75,26 +75,32 @@ def write_kitchen(root: Path, hands: HandPair) -> Path:
 
 def _recording(rng: np.random.Generator, hands: HandPair) -> dict:
     time = np.linspace(0, 1, FRAMES_AT_60_HZ)[:, None]
-    turn = Rotation.from_rotvec(rng.normal(0, 0.6, 3) + time * rng.normal(0, 1.2, 3))
-    place = np.array([0.3, -0.2, 1.0]) + time * rng.normal(0, 0.2, 3)
+    rotation = Rotation.from_rotvec(rng.normal(0, 0.6, 3) + time * rng.normal(0, 1.2, 3))
+    position_m = np.array([0.3, -0.2, 1.0]) + time * rng.normal(0, 0.2, 3)
     pose = np.tile(np.eye(4), (FRAMES_AT_60_HZ, 1, 1))
-    pose[:, :3, :3], pose[:, :3, 3] = turn.as_matrix(), place
+    pose[:, :3, :3], pose[:, :3, 3] = rotation.as_matrix(), position_m
     recording = {"fps": 60, "object": pose.reshape(-1, 16).round(9).tolist()}
-    return recording | {side: _hand(side, turn, place, rng, hands) for side in ("left", "right")}
+    return recording | {side: _hand(side, rotation, position_m, rng, hands) for side in ("left", "right")}
 
 
-def _hand(side: str, turn: Rotation, place: np.ndarray, rng: np.random.Generator, hands: HandPair) -> dict:
+def _hand(side: str, rotation: Rotation, position_m: np.ndarray, rng: np.random.Generator, hands: HandPair) -> dict:
     """Bent about as the mean pose; the middle of index, middle and ring tip lies on the face below the palm."""
     model = hands[side]
-    betas, fingers = rng.normal(0, 0.3, 10), np.tile(rng.normal(0, 0.05, 45), (len(place), 1))
-    flat = HandTrack(np.zeros((1, 3)), np.zeros((1, 3)), fingers[:1] + model.mean_pose, betas[None], np.ones(1, bool))
+    betas, fingers = rng.normal(0, 0.3, 10), np.tile(rng.normal(0, 0.05, 45), (len(position_m), 1))
+    flat = HandTrack(
+        wrist_m=np.zeros((1, 3)),
+        global_orient=np.zeros((1, 3)),
+        hand_pose=fingers[:1] + model.mean_pose,
+        betas=betas[None],
+        valid=np.ones(1, bool),
+    )
     tips = track_joints(flat, model)[0, [16, 17, 19]].mean(axis=0)
     grip = np.array([0.02 if side == "right" else -0.02, HALF_BOX_M[1], 0.0])
-    wrist = place + turn.apply(grip - tips)
+    wrist = position_m + rotation.apply(grip - tips)
     rest = model.joint_regressor[0] @ (model.template_m + model.shape_directions @ betas)
     return {
         "trans": (wrist - rest).round(9).tolist(),
-        "rot": turn.as_rotvec().round(9).tolist(),
+        "rot": rotation.as_rotvec().round(9).tolist(),
         "fingers": fingers.round(9).tolist(),
         "betas": betas.round(9).tolist(),
     }

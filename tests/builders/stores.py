@@ -1,4 +1,4 @@
-"""Stores of tests, written by the stages themselves."""
+"""Stores for tests, written by the stages."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,9 +32,9 @@ def write_annotated(
     quality: bool = False,
     **annotate: Any,
 ) -> Path:
-    """clips, annotation (the encoder without weights), contact and splits below ``root``; quality where asked for.
+    """Write clips, annotation (with the hash encoder), contact and splits below ``root``.
 
-    annotate: further settings of that stage.
+    quality: whether to write quality, too. annotate: further settings of the stage annotate.
     """
     contact = ContactSettings(points=points, threshold_m=threshold_m)
     write_clips(root / "clips", clips, dataset)

@@ -127,7 +127,7 @@ def slide_cm_s(clip: Clip, points_m: np.ndarray) -> float:
 def test_hands_that_slide_more_than_in_training_clips_of_the_verb_are_unusual(
     annotated: AnnotatedStore, diffusion: Checkpoint, check: VerbCheck, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hoidata.actions.action.LEAST_CLIPS", 1)
+    monkeypatch.setattr("hoidata.actions.action.MIN_CLIPS", 1)
     samples, corpus = clips_of(annotated, "train"), Corpus.of(annotated, 0)
     numbers_of = {one.verb: check.numbers(annotated.store.clip(one.clip_id), one.points) for one in samples}
     slips = {str(verb): numbers["slip_cm_s"] for verb, numbers in numbers_of.items()}
@@ -160,7 +160,7 @@ def test_clips_without_a_verb_and_verbs_of_few_clips_have_no_bounds(
 ) -> None:
     corpus = Corpus.of(annotated, 0)
     assert action_results(diffusion.network, corpus)["most_slip_cm_s"] == {}  # one clip of each verb
-    monkeypatch.setattr("hoidata.actions.action.LEAST_CLIPS", 1)
+    monkeypatch.setattr("hoidata.actions.action.MIN_CLIPS", 1)
     monkeypatch.setattr("models.text2hoi.verb_check.verb_of", lambda store, clip_id: None)
     nothing = action_results(diffusion.network, corpus)
     assert nothing["most_slip_cm_s"] == {}
@@ -224,4 +224,4 @@ def test_actions_are_restored_from_a_file_with_any_order_of_keys(annotated: Anno
     random = np.random.default_rng(0)
     for _ in range(20):
         numbers = {name: mean + deviation * random.normal() for name, (mean, deviation) in actions.scale.items()}
-        assert restored.named(numbers) == actions.named(numbers)
+        assert restored.nearest_verb(numbers) == actions.nearest_verb(numbers)

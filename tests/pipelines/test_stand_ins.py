@@ -34,7 +34,7 @@ def test_mano_parameters_converted_with_the_embedded_hand_come_with_a_warning(
     summary = convert_dataset(get_adapter(name), tmp_path / "raw", load_embedded_hands(), tmp_path / "store")
     assert summary.clips
     assert NUMBERS in summary.warning
-    assert capsys.readouterr().out.startswith(f"warning: {name} has MANO parameters, and the embedded hand is no MANO")
+    assert capsys.readouterr().out.startswith(f"warning: {name} has MANO parameters, and the embedded hand is not MANO")
     store = open_store(tmp_path / "store")
     assert NUMBERS in dict(fact_rows(store))["hand model"]
     card = dataset_card(store.folder, store, Description("the store", WORLD, "as stored", columns=(), for_own_use=True))

@@ -1,17 +1,17 @@
-"""What an object does, in numbers of motions that are known; what verbs ask, written and learnt."""
+"""Measures of object motion on motions with known values; limits of verbs, from the file and from clips."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.actions.action import (
-    LEARNT,
-    NUMBERS,
-    WORDS,
+    MEASURE_TEXTS,
+    MEASURES,
+    VERB_MEASURES,
     Actions,
     action_numbers,
-    beside_usual,
-    is_seen,
+    describe_unusual,
+    is_visible,
     learn_actions,
     written_limits,
 )
@@ -21,33 +21,35 @@ from tests.builders.clips import in_another_world
 from tests.builders.objects import box_model, notebook
 
 DOWN = np.array([0.0, 0.0, -1.0])
-NOBODY = np.zeros((2, 1), bool)
+NO_CONTACT = np.zeros((2, 1), bool)
 
 
 def track(path_m=None, rotvec=None, model=None, hinge_rad=None) -> ObjectTrack:
-    """An object along (frame, 3) places and turns; what is not given stays where it is."""
+    """An object with these (frame, 3) positions and rotations, by default zero."""
     n_frames = max(len(array) for array in (path_m, rotvec, hinge_rad) if array is not None)
     still = np.zeros((n_frames, 3), np.float32)
-    place, turn = (still if array is None else np.asarray(array, np.float32) for array in (path_m, rotvec))
-    return ObjectTrack(model or box_model(), turn, place, hinge_rad)
+    translation_m, object_rotvec = (
+        still if array is None else np.asarray(array, np.float32) for array in (path_m, rotvec)
+    )
+    return ObjectTrack(model or box_model(), object_rotvec, translation_m, hinge_rad)
 
 
-def numbers_of(moving: ObjectTrack, touching=NOBODY, gravity=DOWN) -> dict[str, float]:
+def numbers_of(moving: ObjectTrack, touching=NO_CONTACT, gravity=DOWN) -> dict[str, float]:
     return action_numbers(moving, gravity, np.broadcast_to(touching, (2, moving.n_frames)))
 
 
 def there_and_back(n_frames: int, far: tuple[float, float, float]) -> np.ndarray:
-    way = np.concatenate([np.linspace(0, 1, n_frames // 2), np.linspace(1, 0, n_frames - n_frames // 2)])
-    return way[:, None] * np.array(far)
+    progress = np.concatenate([np.linspace(0, 1, n_frames // 2), np.linspace(1, 0, n_frames - n_frames // 2)])
+    return progress[:, None] * np.array(far)
 
 
-def test_rise_way_and_path_are_those_of_the_object_s_middle():
-    found = numbers_of(track(there_and_back(40, (0.3, 0.4, 0.2))))
-    assert set(found) == set(NUMBERS)
-    assert found["rise_m"] == pytest.approx(0.2, abs=1e-6)
-    assert found["sideways_m"] == pytest.approx(0.5, abs=1e-6)
-    assert found["end_rise_m"] == found["end_sideways_m"] == pytest.approx(0, abs=1e-6)
-    assert found["path_m"] == pytest.approx(2 * np.sqrt(0.29), abs=1e-5)
+def test_rise_sideways_and_path_are_those_of_the_object_centre():
+    measures = numbers_of(track(there_and_back(40, (0.3, 0.4, 0.2))))
+    assert set(measures) == set(MEASURES)
+    assert measures["rise_m"] == pytest.approx(0.2, abs=1e-6)
+    assert measures["sideways_m"] == pytest.approx(0.5, abs=1e-6)
+    assert measures["end_rise_m"] == measures["end_sideways_m"] == pytest.approx(0, abs=1e-6)
+    assert measures["path_m"] == pytest.approx(2 * np.sqrt(0.29), abs=1e-5)
     off_centre = track(rotvec=np.linspace(0, np.pi, 30)[:, None] * [1, 0, 0], model=box_model(middle_m=(0, 0, -0.3)))
     assert numbers_of(off_centre)["end_rise_m"] == pytest.approx(0.6, abs=1e-6)
 
@@ -85,30 +87,30 @@ def test_a_corner_turns_back_where_it_is_sharper_than_120_degrees(turn_deg, reve
     assert numbers_of(track(0.01 * np.cumsum(steps, axis=0)))["reversals_per_s"] == reversals
 
 
-def test_the_hinge_counts_from_where_it_was_and_a_rigid_object_has_none():
+def test_hinge_change_is_relative_to_the_first_frame_and_zero_for_rigid_objects():
     hinge = np.radians(np.concatenate([np.linspace(10, -70, 20), np.linspace(-70, -20, 20)]))
-    found = numbers_of(track(hinge_rad=hinge, model=notebook()))
-    assert (found["hinge_net_deg"], found["hinge_max_deg"]) == pytest.approx((-30, 80))
+    measures = numbers_of(track(hinge_rad=hinge, model=notebook()))
+    assert (measures["hinge_net_deg"], measures["hinge_max_deg"]) == pytest.approx((-30, 80))
     rigid = numbers_of(track(np.zeros((5, 3))))
     assert (rigid["hinge_net_deg"], rigid["hinge_max_deg"]) == (0, 0)
 
 
-def test_the_hands_that_hold_it_first_and_last_are_told():
+def test_the_grasping_hands_at_start_and_end_are_measured():
     touching = np.zeros((2, 20), bool)
     touching[1, 2:12] = touching[0, 10:18] = True  # from right to left
-    found = numbers_of(track(np.zeros((20, 3))), touching)
-    hands = {name: found[name] for name in ("first_left", "first_right", "last_left", "last_right", "hand_changes")}
+    measures = numbers_of(track(np.zeros((20, 3))), touching)
+    hands = {name: measures[name] for name in ("first_left", "first_right", "last_left", "last_right", "hand_changes")}
     assert hands == {"first_left": 0, "first_right": 1, "last_left": 1, "last_right": 0, "hand_changes": 2}
     assert numbers_of(track(np.zeros((20, 3))))["hand_changes"] == 0
     touching[:, 2:18] = True
     touching[0, 2:4] = touching[1, 17] = False  # both hold it, one comes later and the other leaves sooner
-    found = numbers_of(track(np.zeros((20, 3))), touching)
-    assert (found["hand_changes"], found["first_left"], found["last_right"]) == (0, 1, 1)
+    measures = numbers_of(track(np.zeros((20, 3))), touching)
+    assert (measures["hand_changes"], measures["first_left"], measures["last_right"]) == (0, 1, 1)
 
 
 def test_numbers_are_the_same_in_another_world_and_without_gravity_only_what_needs_it_is_unknown(make_clip):
-    clip, turn = make_clip(20, articulated=True), Rotation.from_rotvec([0.4, -1.0, 2.0])
-    moved = in_another_world(clip, turn, np.array([1.0, -2.0, 0.5]))
+    clip, rotation = make_clip(20, articulated=True), Rotation.from_rotvec([0.4, -1.0, 2.0])
+    moved = in_another_world(clip, rotation, np.array([1.0, -2.0, 0.5]))
     one, other = (action_numbers(item.object, item.gravity, np.zeros((2, 20), bool)) for item in (clip, moved))
     assert one == pytest.approx(other, abs=1e-2)
     assert one["tilt_deg"] > 1
@@ -131,75 +133,76 @@ def test_limits_learnt_from_training_clips_hold_for_others_of_the_verb_and_fail_
     actions, others = learn_actions(lifts_and_pours(0)), lifts_and_pours(1)
     assert actions.facts == {"limits": [], "learnt": {"lift": 10, "pour": 10}}
     for verb, other in (("lift", "pour"), ("pour", "lift")):
-        assert all(actions.followed(verb, row) is True for row in others[verb])
-        assert all(actions.followed(other, row) is False for row in others[verb])
-        assert all(actions.named(row) == verb for row in others[verb])
-    assert actions.followed("juggle", others["lift"][0]) is None
-    assert actions.followed(None, others["lift"][0]) is None
+        assert all(actions.satisfies_limits(verb, clip) is True for clip in others[verb])
+        assert all(actions.satisfies_limits(other, clip) is False for clip in others[verb])
+        assert all(actions.nearest_verb(clip) == verb for clip in others[verb])
+    assert actions.satisfies_limits("juggle", others["lift"][0]) is None
+    assert actions.satisfies_limits(None, others["lift"][0]) is None
 
 
-def test_what_no_training_clip_of_the_verb_does_is_named_whatever_the_written_limits():
+def test_measures_outside_the_usual_range_are_described_whatever_the_written_limits():
     numbers, others = lifts_and_pours(0), lifts_and_pours(1)
     actions = learn_actions(numbers, {"lift": {"end_rise_m": (0.1, 0.3)}})
     for verb in ("lift", "pour"):
-        assert all(actions.unusual(verb, row) == () for row in others[verb])
-    said = actions.unusual("lift", others["pour"][0])
-    most = max(row["tilt_deg"] for row in numbers["lift"]) + 0.5 * actions.scale["tilt_deg"][1]
+        assert all(actions.unusual(verb, clip) == () for clip in others[verb])
+    texts = actions.unusual("lift", others["pour"][0])
+    most = max(clip["tilt_deg"] for clip in numbers["lift"]) + 0.5 * actions.scale["tilt_deg"][1]
     tilt = others["pour"][0]["tilt_deg"]
-    assert f"greatest tilt {tilt:.3g} degrees (usual: at most {most:.3g})" in said
+    assert f"greatest tilt {tilt:.3g} degrees (usual: at most {most:.3g})" in texts
     least_m, most_m = (100 * bound for bound in actions.usual["lift"]["rise_m"])
     rise_m = 100 * others["pour"][0]["rise_m"]
-    assert f"highest rise {rise_m:.3g} cm (usual: {least_m:.3g} to {most_m:.3g})" in said
+    assert f"highest rise {rise_m:.3g} cm (usual: {least_m:.3g} to {most_m:.3g})" in texts
     assert actions.unusual("lift", numbers["lift"][0] | {"rise_m": float("nan")}) == ()
     assert actions.unusual("juggle", numbers["lift"][0]) == ()
-    beyond = actions.beyond("lift", others["pour"][0])
-    assert {"tilt_deg", "rise_m"} <= set(beyond)
-    assert len(beyond) == len(said)
-    assert beyond["tilt_deg"] == pytest.approx((tilt - most) / (2 * most))
+    violations = actions.violations("lift", others["pour"][0])
+    assert {"tilt_deg", "rise_m"} <= set(violations)
+    assert len(violations) == len(texts)
+    assert violations["tilt_deg"] == pytest.approx((tilt - most) / (2 * most))
     least_m, most_m = actions.usual["lift"]["rise_m"]
     low = numbers["lift"][0] | {"rise_m": least_m - 2 * (most_m - least_m)}
-    assert actions.beyond("lift", low)["rise_m"] == pytest.approx(2)
-    assert actions.beyond("lift", numbers["lift"][0]) == {} == actions.beyond("juggle", low)
+    assert actions.violations("lift", low)["rise_m"] == pytest.approx(2)
+    assert actions.violations("lift", numbers["lift"][0]) == {} == actions.violations("juggle", low)
 
 
-def test_bounds_are_as_wide_as_the_verbs_own_clips_differ_and_learnt_limits_as_all_clips_do():
+def test_usual_ranges_are_widened_by_the_verbs_deviation_and_limits_by_that_of_all_clips():
     still = numbers_of(track(np.zeros((30, 3))))
 
     def shakes(apart: float) -> list[dict[str, float]]:
         return [still | {"reversals_per_s": 2.5 + apart * number} for number in range(-5, 6)]
 
-    for apart, of_its_own in ((0.12, True), (0.06, False)):
-        rows = {"shake": shakes(apart), "hold": [still] * 30}
-        actions, own = learn_actions(rows), np.sqrt(10) * apart
-        every = np.std([row["reversals_per_s"] for verb in rows for row in rows[verb]])
-        assert 1 < every == pytest.approx(actions.scale["reversals_per_s"][1])
-        assert (own > 0.25 * every) == of_its_own
+    for apart, uses_verb_deviation in ((0.12, True), (0.06, False)):
+        clips = {"shake": shakes(apart), "hold": [still] * 30}
+        actions, verb_deviation = learn_actions(clips), np.sqrt(10) * apart
+        deviation = np.std([clip["reversals_per_s"] for verb in clips for clip in clips[verb]])
+        assert 1 < deviation == pytest.approx(actions.scale["reversals_per_s"][1])
+        assert (verb_deviation > 0.25 * deviation) == uses_verb_deviation
         for verb, middle, half in (("shake", 2.5, 4.9 * apart), ("hold", 0, 0)):  # 1st and 99th percentile of eleven
-            usual, learnt = 0.5 * (own if of_its_own and verb == "shake" else every), 0.5 * every
+            usual = 0.5 * (verb_deviation if uses_verb_deviation and verb == "shake" else deviation)
+            learnt = 0.5 * deviation
             bounds, limits = actions.usual[verb]["reversals_per_s"], actions.limits[verb]["reversals_per_s"]
             assert bounds == pytest.approx((middle - half - usual, middle + half + usual))
             assert limits == pytest.approx((middle - half - learnt, middle + half + learnt))
 
 
-def test_written_limits_count_where_the_training_clips_keep_them():
+def test_written_limits_are_used_if_the_training_clips_satisfy_them():
     numbers = lifts_and_pours(0)
-    kept = learn_actions(numbers, {"lift": {"end_rise_m": (0.1, 0.3)}})
-    assert kept.facts == {"limits": ["lift"], "learnt": {"pour": 10}}
-    assert kept.followed("lift", numbers["lift"][0] | {"tilt_deg": 170}) is True
-    assert kept.followed("lift", numbers["lift"][0] | {"end_rise_m": 0.09}) is False
-    broken = learn_actions(numbers, {"lift": {"end_rise_m": (1.0, 2.0)}})
-    assert broken.facts == {"limits": [], "learnt": {"lift": 10, "pour": 10}}
+    satisfied = learn_actions(numbers, {"lift": {"end_rise_m": (0.1, 0.3)}})
+    assert satisfied.facts == {"limits": ["lift"], "learnt": {"pour": 10}}
+    assert satisfied.satisfies_limits("lift", numbers["lift"][0] | {"tilt_deg": 170}) is True
+    assert satisfied.satisfies_limits("lift", numbers["lift"][0] | {"end_rise_m": 0.09}) is False
+    violated = learn_actions(numbers, {"lift": {"end_rise_m": (1.0, 2.0)}})
+    assert violated.facts == {"limits": [], "learnt": {"lift": 10, "pour": 10}}
 
 
-def test_a_number_that_is_unknown_gives_no_answer_where_it_is_asked_for():
+def test_limits_of_a_measure_that_is_nan_give_no_answer():
     actions = Actions({"lift": {"rise_m": (0, 1)}, "open": {"hinge_net_deg": (20, 90)}}, {}, {}, {})
     weightless = action_numbers(track(np.zeros((5, 3))), None, np.zeros((2, 5), bool))
-    assert actions.followed("lift", weightless) is None
-    assert actions.followed("open", weightless) is False
-    assert actions.named(weightless) is None
+    assert actions.satisfies_limits("lift", weightless) is None
+    assert actions.satisfies_limits("open", weightless) is False
+    assert actions.nearest_verb(weightless) is None
 
 
-def test_a_table_of_limits_is_read_and_one_that_names_no_number_is_refused(tmp_path):
+def test_a_table_of_limits_is_read_and_one_with_an_unknown_measure_is_refused(tmp_path):
     path = tmp_path / "actions.toml"
     path.write_text('[lift]\nrise_m = [0.05, 1]\n["hand over"]\nhand_changes = [1, 2]\n[open]\nhands = "one hold"\n')
     assert written_limits(path) == {
@@ -216,40 +219,44 @@ def test_a_table_of_limits_is_read_and_one_that_names_no_number_is_refused(tmp_p
     assert written_limits(tmp_path / "nothing.toml") == {}
 
 
-def test_the_limits_that_are_written_here_can_be_read_and_tell_open_from_close():
+def test_the_limits_of_actions_toml_distinguish_open_from_close():
     written = written_limits()
     assert written["open"]["hinge_net_deg"][0] > 0 > written["close"]["hinge_net_deg"][1]
     assert written["hand over"]["hand_changes"] == (1, 2)
 
 
-def test_every_number_that_may_be_unusual_has_words_of_its_own():
-    assert set(LEARNT) <= set(WORDS)
-    assert len({words.what for words in WORDS.values()}) == len(WORDS)
-    assert beside_usual("end_rise_m", -0.031, -0.015, 0.02) == "rise at the end -3.1 cm (usual: -1.5 to 2)"
-    assert beside_usual("reversals_per_s", 2.0, -0.5, 0.5) == "turns back 2 times a second (usual: at most 0.5)"
-    assert beside_usual("hand_changes", 1.0, 1.5, 2.5) == "hands that take or give 1 (usual: 2 to 2)"
-    assert beside_usual("path_m", 12.344, 0.2, 1.0) == "length of the path 1234 cm (usual: 20 to 100)"
+def test_each_verb_measure_has_a_text():
+    assert set(VERB_MEASURES) <= set(MEASURE_TEXTS)
+    assert len({text.label for text in MEASURE_TEXTS.values()}) == len(MEASURE_TEXTS)
+    assert describe_unusual("end_rise_m", -0.031, -0.015, 0.02) == "rise at the end -3.1 cm (usual: -1.5 to 2)"
+    assert describe_unusual("reversals_per_s", 2.0, -0.5, 0.5) == "turns back 2 times a second (usual: at most 0.5)"
+    assert describe_unusual("hand_changes", 1.0, 1.5, 2.5) == "hands that take or give 1 (usual: 2 to 2)"
+    assert describe_unusual("path_m", 12.344, 0.2, 1.0) == "length of the path 1234 cm (usual: 20 to 100)"
 
 
 @pytest.mark.parametrize(
     ("name", "value", "most"),
     [("turn_deg", 27.14, 27.12), ("rise_m", 0.12341, 0.1234), ("slip_cm_s", 0.026501, 0.0265)],
 )
-def test_a_number_that_reads_as_its_bound_is_not_said(name: str, value: float, most: float) -> None:
+def test_a_measure_that_rounds_to_its_bound_is_not_described(name: str, value: float, most: float) -> None:
     """It would be "27.1 degrees (usual: at most 27.1)"."""
-    assert beside_usual(name, value, 0.0, most) is None
-    assert beside_usual(name, value + WORDS[name].seen, 0.0, most) is not None
-    actions = Actions({}, {}, {}, {}, {"pour": {name: (0.0, most)}})
+    assert describe_unusual(name, value, 0.0, most) is None
+    assert describe_unusual(name, value + MEASURE_TEXTS[name].visible_difference, 0.0, most) is not None
+    actions = Actions(limits={}, learnt={}, centroids={}, scale={}, usual={"pour": {name: (0.0, most)}})
     assert actions.unusual("pour", {name: value}) == ()
-    assert actions.beyond("pour", {name: value})
+    assert actions.violations("pour", {name: value})
 
 
-@pytest.mark.parametrize("name", sorted(WORDS))
-def test_a_difference_is_seen_from_its_own_size_on_either_side(name: str) -> None:
-    seen = WORDS[name].seen
-    assert [is_seen(name, 2 + share * seen, 1.0, 2.0) for share in (0.0, 0.9, 1.01)] == [False, False, True]
-    assert [is_seen(name, 1 - share * seen, 1.0, 2.0) for share in (0.0, 0.9, 1.01)] == [False, False, True]
-    assert not is_seen(name, 1.5, 1.0, 2.0)
-    actions = Actions({}, {}, {}, {}, {"pour": {name: (1.0, 2.0)}})
-    assert len(actions.seen("pour", {name: 2 + 1.01 * seen})) == 1
-    assert actions.seen("pour", {name: 2 + 0.9 * seen}) == actions.seen("lift", {name: 2 + 9 * seen}) == ()
+@pytest.mark.parametrize("name", sorted(MEASURE_TEXTS))
+def test_a_difference_is_visible_from_its_threshold_on_either_side(name: str) -> None:
+    visible = MEASURE_TEXTS[name].visible_difference
+    assert [is_visible(name, 2 + fraction * visible, 1.0, 2.0) for fraction in (0.0, 0.9, 1.01)] == [False, False, True]
+    assert [is_visible(name, 1 - fraction * visible, 1.0, 2.0) for fraction in (0.0, 0.9, 1.01)] == [False, False, True]
+    assert not is_visible(name, 1.5, 1.0, 2.0)
+    actions = Actions(limits={}, learnt={}, centroids={}, scale={}, usual={"pour": {name: (1.0, 2.0)}})
+    assert len(actions.visibly_unusual("pour", {name: 2 + 1.01 * visible})) == 1
+    assert (
+        actions.visibly_unusual("pour", {name: 2 + 0.9 * visible})
+        == actions.visibly_unusual("lift", {name: 2 + 9 * visible})
+        == ()
+    )

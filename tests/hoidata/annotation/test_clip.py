@@ -1,4 +1,4 @@
-"""CLIP's text tower through open_clip with random weights, and what is said where real weights are not there.
+"""CLIP's text tower through open_clip with random weights, and the errors without real weights.
 
 The slow tests need the extra ``hoidata[clip]``; real weights are never needed and nothing is downloaded.
 """
@@ -40,26 +40,26 @@ OPEN_CLIP = SimpleNamespace(
     ],
 )
 def test_a_name_is_a_tag_or_a_file_with_its_activation(text, name, quick_gelu, is_tag) -> None:
-    found = parse_weights_name(text)
-    assert (found.name, found.quick_gelu, found.is_tag) == (name, quick_gelu, is_tag)
+    weights_name = parse_weights_name(text)
+    assert (weights_name.name, weights_name.quick_gelu, weights_name.is_tag) == (name, quick_gelu, is_tag)
 
 
-def test_a_tag_on_this_machine_is_taken_without_a_look_at_the_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
+def test_a_cached_tag_needs_no_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    requests = []
 
     def cached(repository: str, file: str) -> Path:
-        asked.append((repository, file))
+        requests.append((repository, file))
         return Path("/cache") / file
 
     monkeypatch.setattr(clip_weights, "_cached", cached)
     monkeypatch.setattr(clip_weights, "is_reachable", lambda *_: pytest.fail("looked"))
     assert tagged_weights(OPEN_CLIP, "openai") == (Path("/cache/open_clip_model.safetensors"), True)
     assert tagged_weights(OPEN_CLIP, "laion2b") == (Path("/cache/weights.safetensors"), False)
-    assert asked == [("timm/vit.openai", "open_clip_model.safetensors"), ("laion/vit", "weights.safetensors")]
+    assert requests == [("timm/vit.openai", "open_clip_model.safetensors"), ("laion/vit", "weights.safetensors")]
 
 
 @pytest.mark.parametrize(("tag", "gelu"), [("openai", "true"), ("laion2b", "false")])
-def test_offline_the_way_out_is_named_with_the_tags_own_activation(monkeypatch: pytest.MonkeyPatch, tag, gelu) -> None:
+def test_offline_the_remedy_names_the_activation_of_the_tag(monkeypatch: pytest.MonkeyPatch, tag, gelu) -> None:
     pytest.importorskip("huggingface_hub")
     monkeypatch.setattr(clip_weights, "_cached", lambda *_: None)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
@@ -98,7 +98,7 @@ def test_a_listening_address_is_reachable_and_a_closed_port_is_not(monkeypatch: 
 
 
 @pytest.mark.parametrize("scheme", ["", "http://"])
-def test_behind_a_proxy_it_is_the_proxy_that_is_asked(monkeypatch: pytest.MonkeyPatch, scheme: str) -> None:
+def test_behind_a_proxy_the_proxy_is_tried(monkeypatch: pytest.MonkeyPatch, scheme: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         proxy = f"{scheme}127.0.0.1:{server.getsockname()[1]}"
         monkeypatch.setattr(clip_weights, "getproxies", lambda: {"https": proxy})
@@ -115,7 +115,7 @@ def towers(tmp_path_factory: pytest.TempPathFactory):
 
     open_clip, folder = import_open_clip(), tmp_path_factory.mktemp("clip")
     config = open_clip.get_model_config(ARCHITECTURE)["text_cfg"]
-    made = {}
+    towers_by_name = {}
     for name, size in {"whole": {}, "tiny": {"width": 64, "heads": 1, "layers": 2}}.items():
         torch.manual_seed(0)
         tower = open_clip.model._build_text_tower(512, {**config, **size}, quick_gelu=True).eval()
@@ -124,8 +124,11 @@ def towers(tmp_path_factory: pytest.TempPathFactory):
             {**state, "visual.proj": torch.zeros(3), "logit_scale": torch.zeros(())}, folder / f"{name}.safetensors"
         )
         with torch.no_grad():
-            made[name] = folder / f"{name}.safetensors", tower(open_clip.get_tokenizer(ARCHITECTURE)(SENTENCES)).numpy()
-    return made
+            towers_by_name[name] = (
+                folder / f"{name}.safetensors",
+                tower(open_clip.get_tokenizer(ARCHITECTURE)(SENTENCES)).numpy(),
+            )
+    return towers_by_name
 
 
 @pytest.mark.slow
@@ -143,7 +146,7 @@ def test_the_short_tower_equals_open_clips_whole_one(towers, size: str, name: st
 
 @pytest.mark.slow
 @needs_open_clip
-def test_a_clip_feature_depends_on_its_own_sentence_alone(towers) -> None:
+def test_a_clip_feature_depends_only_on_its_sentence(towers) -> None:
     import torch
 
     path, _ = towers["whole"]
@@ -174,26 +177,26 @@ def transformers_names(state: dict) -> dict:
     """A tower of open_clip's by the names and shapes that transformers gives a CLIPModel's, with an image tower."""
     import torch
 
-    own = {
+    tensors = {
         "text_projection.weight": state["text_projection"].T,
         "vision_model.embeddings.class_embedding": torch.ones(2),
     }
-    own |= {"logit_scale": torch.zeros(()), "text_model.embeddings.position_ids": torch.arange(77)[None]}
-    own["text_model.embeddings.token_embedding.weight"] = state["token_embedding.weight"]
-    own["text_model.embeddings.position_embedding.weight"] = state["positional_embedding"]
+    tensors |= {"logit_scale": torch.zeros(()), "text_model.embeddings.position_ids": torch.arange(77)[None]}
+    tensors["text_model.embeddings.token_embedding.weight"] = state["token_embedding.weight"]
+    tensors["text_model.embeddings.position_embedding.weight"] = state["positional_embedding"]
     for kind in ("weight", "bias"):
-        own[f"text_model.final_layer_norm.{kind}"] = state[f"ln_final.{kind}"]
+        tensors[f"text_model.final_layer_norm.{kind}"] = state[f"ln_final.{kind}"]
         for layer in range(sum(name.endswith("ln_1.weight") for name in state)):
-            there, here = f"text_model.encoder.layers.{layer}", f"transformer.resblocks.{layer}"
-            query, key, value = state[f"{here}.attn.in_proj_{kind}"].chunk(3)
-            own |= {f"{there}.self_attn.q_proj.{kind}": query, f"{there}.self_attn.k_proj.{kind}": key}
-            own |= {f"{there}.self_attn.v_proj.{kind}": value}
-            own[f"{there}.self_attn.out_proj.{kind}"] = state[f"{here}.attn.out_proj.{kind}"]
-            own[f"{there}.layer_norm1.{kind}"] = state[f"{here}.ln_1.{kind}"]
-            own[f"{there}.layer_norm2.{kind}"] = state[f"{here}.ln_2.{kind}"]
-            own[f"{there}.mlp.fc1.{kind}"] = state[f"{here}.mlp.c_fc.{kind}"]
-            own[f"{there}.mlp.fc2.{kind}"] = state[f"{here}.mlp.c_proj.{kind}"]
-    return own
+            target, source = f"text_model.encoder.layers.{layer}", f"transformer.resblocks.{layer}"
+            query, key, value = state[f"{source}.attn.in_proj_{kind}"].chunk(3)
+            tensors |= {f"{target}.self_attn.q_proj.{kind}": query, f"{target}.self_attn.k_proj.{kind}": key}
+            tensors |= {f"{target}.self_attn.v_proj.{kind}": value}
+            tensors[f"{target}.self_attn.out_proj.{kind}"] = state[f"{source}.attn.out_proj.{kind}"]
+            tensors[f"{target}.layer_norm1.{kind}"] = state[f"{source}.ln_1.{kind}"]
+            tensors[f"{target}.layer_norm2.{kind}"] = state[f"{source}.ln_2.{kind}"]
+            tensors[f"{target}.mlp.fc1.{kind}"] = state[f"{source}.mlp.c_fc.{kind}"]
+            tensors[f"{target}.mlp.fc2.{kind}"] = state[f"{source}.mlp.c_proj.{kind}"]
+    return tensors
 
 
 def below(prefix: str):
@@ -260,21 +263,23 @@ def test_half_precision_is_read_as_float32(tiny_tower, tmp_path: Path) -> None:
     assert {tensor.dtype for tensor in read_tower(tmp_path / "half.pt").values()} == {torch.float32}
 
 
-def test_what_is_no_whole_text_tower_is_refused_with_its_reason(tiny_tower, tmp_path: Path) -> None:
+def test_an_incomplete_text_tower_is_refused_with_its_reason(tiny_tower, tmp_path: Path) -> None:
     import zipfile
 
     import torch
 
-    def refused(tensors: dict, says: str) -> None:
+    def refused(tensors: dict, message: str) -> None:
         torch.save(contiguous(tensors), tmp_path / "weights.bin")
-        with pytest.raises(BadInput, match=says):
+        with pytest.raises(BadInput, match=message):
             read_tower(tmp_path / "weights.bin")
 
     theirs = transformers_names(tiny_tower)
-    refused({name: own for name, own in theirs.items() if name != "text_projection.weight"}, "CLIPTextModelWithProj")
-    refused({name: own for name, own in theirs.items() if "k_proj" not in name}, "q_proj, k_proj and v_proj")
+    refused(
+        {name: tensor for name, tensor in theirs.items() if name != "text_projection.weight"}, "CLIPTextModelWithProj"
+    )
+    refused({name: tensor for name, tensor in theirs.items() if "k_proj" not in name}, "q_proj, k_proj and v_proj")
     refused({"bert.encoder.weight": torch.ones(1)}, "names of open_clip, OpenAI or transformers, got tensors bert.enc")
-    refused(tiny_tower | below("text.")(tiny_tower), "got 2 of them")
+    refused(tiny_tower | below("text.")(tiny_tower), "got 2 towers")
     for name in ("archive/data.pkl", "archive/constants.pkl"):
         with zipfile.ZipFile(tmp_path / "script.pt", "a") as archive:
             archive.writestr(name, "")

@@ -27,14 +27,14 @@ def annotated(clips: Path, out: Path) -> tuple[pd.DataFrame, pd.Series]:
 def by_clip(sequences: list[TruthSequence], clips: Path) -> dict[str, TruthSequence]:
     truths = {(truth.source_key, int(truth.source_frames[0])): truth for truth in sequences}
     rows = open_store(clips).sequences
-    return {row.clip_id: truths[row.sequence, row.first_source_frame] for row in rows.itertuples()}
+    return {entry.clip_id: truths[entry.sequence, entry.first_source_frame] for entry in rows.itertuples()}
 
 
 @pytest.mark.parametrize("dataset", ["h2o", "grab", "arctic"])
 def test_the_known_hand_is_found_and_every_sentence_names_it_alone(dataset: str, small_corpus, tmp_path: Path) -> None:
-    made = small_corpus(dataset)
-    hands, text = annotated(made.clips, tmp_path)
-    truths = by_clip(made.truths, made.clips)
+    corpus = small_corpus(dataset)
+    hands, text = annotated(corpus.clips, tmp_path)
+    truths = by_clip(corpus.truths, corpus.clips)
     assert set(truths) == set(hands.index) == set(text.index)
     assert len(truths) >= 8
     for clip_id, truth in truths.items():
@@ -47,17 +47,17 @@ def test_the_known_hand_is_found_and_every_sentence_names_it_alone(dataset: str,
 
 def test_arctic_without_descriptions_gets_verb_and_hand_from_the_motion(small_corpus, tmp_path: Path) -> None:
     """Whole sequences have neither word nor hand; those with one action only are named for it."""
-    made, adapter = small_corpus("arctic"), get_adapter("arctic", clips="whole")
-    convert_dataset(adapter, made.raw, load_embedded_hands(), tmp_path / "clips", progress=False, synthetic=True)
+    corpus, adapter = small_corpus("arctic"), get_adapter("arctic", clips="whole")
+    convert_dataset(adapter, corpus.raw, load_embedded_hands(), tmp_path / "clips", progress=False, synthetic=True)
     hands, text = annotated(tmp_path / "clips", tmp_path)
     assert hands["labelled_hand"].isna().all()
     assert set(hands["verb_source"]) == {"derived"}
     assert hands["verb_evidence"].notna().all()
-    for clip_id, row in hands.iterrows():
-        within = [truth for truth in made.truths if f"arctic/{truth.source_key}" == clip_id]
-        sides = {side for truth in within for side in truth.acting_sides}
-        assert row["hand_type"] == ("both" if len(sides) == 2 else min(sides))
+    for clip_id, entry in hands.iterrows():
+        within = [truth for truth in corpus.truths if f"arctic/{truth.source_key}" == clip_id]
+        sides = {side for truth in within for side in truth.active_sides}
+        assert entry["hand_type"] == ("both" if len(sides) == 2 else min(sides))
         if len(within) == 1:
-            assert row["verb"] == within[0].verb
-        assert text[clip_id][0].lower().startswith(row["verb"])
-    assert any(sum(f"arctic/{truth.source_key}" == clip_id for truth in made.truths) == 1 for clip_id in hands.index)
+            assert entry["verb"] == within[0].verb
+        assert text[clip_id][0].lower().startswith(entry["verb"])
+    assert any(sum(f"arctic/{truth.source_key}" == clip_id for truth in corpus.truths) == 1 for clip_id in hands.index)

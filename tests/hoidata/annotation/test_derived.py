@@ -30,10 +30,10 @@ def clip(
     model: ObjectModel, path_m: Any = 0.0, turn_rad: Any = 0.0, hinge_rad: Any = None, gravity: Any = DOWN
 ) -> Clip:
     """path_m: (frame, 3); turn_rad: (frame,) about x, after a start that is not the identity."""
-    turn = Rotation.from_rotvec(np.broadcast_to(turn_rad, FRAMES)[:, None] * np.eye(3)[0])
+    rotation = Rotation.from_rotvec(np.broadcast_to(turn_rad, FRAMES)[:, None] * np.eye(3)[0])
     path = (np.array([0.3, -0.2, 0.9]) + path_m + np.zeros((FRAMES, 3))).astype(np.float32)
     hinge = None if hinge_rad is None else np.broadcast_to(hinge_rad, FRAMES).astype(np.float32)
-    rotvec = (turn * Rotation.from_rotvec([0.4, -1.1, 0.7])).as_rotvec().astype(np.float32)
+    rotvec = (rotation * Rotation.from_rotvec([0.4, -1.1, 0.7])).as_rotvec().astype(np.float32)
     return clip_of("toy/s1/1", ObjectTrack(model, rotvec, path, hinge), gravity=gravity, verb=None)
 
 
@@ -133,9 +133,9 @@ def test_a_frame_is_touched_by_either_hand() -> None:
         "left": np.where(PHASE < 0.5, 0.01, 0.1),
         "right": np.where(PHASE < 0.5, 0.1, 0.01),
     }
-    found = HandEvidence(None, distance, 0.02).at_threshold(0.02)
-    assert object_motion(clip(BOX), found).touched == 1
-    assert derive_verb(clip(BOX), found).verb == "hold"
+    result = HandEvidence(None, distance, 0.02).at_threshold(0.02)
+    assert object_motion(clip(BOX), result).touched == 1
+    assert derive_verb(clip(BOX), result).verb == "hold"
 
 
 SWING = along(0, 0.02 * np.sin(2 * np.pi * 4 * np.arange(FRAMES) / 30))
@@ -166,8 +166,8 @@ def test_an_object_far_from_its_own_origin_moves_only_when_its_middle_does() -> 
 
 def test_the_evidence_says_what_was_measured() -> None:
     assert derive_verb(clip(BOX, path_m=along(2, 0.15 * SMOOTH)), evidence()).evidence == "rises 15.0 cm"
-    found = derive_verb(clip(NOTEBOOK, hinge_rad=0.6 - 0.5 * SMOOTH), evidence())
-    assert found.evidence == "hinge from 0.60 to 0.10 rad, between 0.10 and 0.60"
+    result = derive_verb(clip(NOTEBOOK, hinge_rad=0.6 - 0.5 * SMOOTH), evidence())
+    assert result.evidence == "hinge from 0.60 to 0.10 rad, between 0.10 and 0.60"
 
 
 @settings(max_examples=25, deadline=None)
@@ -177,9 +177,9 @@ def test_the_evidence_says_what_was_measured() -> None:
         [along(2, 0.15 * SMOOTH), along(0, 0.12 * SMOOTH), along(2, 0.04 * SMOOTH), along(2, -0.15 * SMOOTH)]
     ),
 )
-def test_a_world_that_is_turned_and_shifted_changes_no_verb(turn: tuple[float, ...], path_m: np.ndarray) -> None:
+def test_a_world_that_is_turned_and_shifted_changes_no_verb(rotation: tuple[float, ...], path_m: np.ndarray) -> None:
     still = clip(BOX, path_m=path_m)
-    assert verb(in_another_world(still, Rotation.from_rotvec(turn), np.array([1.0, -2.0, 0.5]))) == verb(still)
+    assert verb(in_another_world(still, Rotation.from_rotvec(rotation), np.array([1.0, -2.0, 0.5]))) == verb(still)
 
 
 MOTIONS = {
@@ -198,11 +198,11 @@ MOTIONS = {
 @pytest.mark.parametrize("expected", MOTIONS)
 def test_jitter_of_two_millimetres_and_one_degree_changes_no_verb(expected: str) -> None:
     rng, track = np.random.default_rng(0), MOTIONS[expected].object
-    turn = Rotation.from_rotvec(rng.normal(size=(FRAMES, 3)) * np.deg2rad(1) / 3**0.5)
+    rotation = Rotation.from_rotvec(rng.normal(size=(FRAMES, 3)) * np.deg2rad(1) / 3**0.5)
     hinge = None if track.hinge_rad is None else track.hinge_rad + rng.normal(size=FRAMES) * np.deg2rad(1)
     shaken = replace(
         track,
-        rotvec=(turn * Rotation.from_rotvec(track.rotvec)).as_rotvec().astype(np.float32),
+        rotvec=(rotation * Rotation.from_rotvec(track.rotvec)).as_rotvec().astype(np.float32),
         translation_m=(track.translation_m + rng.normal(size=(FRAMES, 3)) * 0.002).astype(np.float32),
         hinge_rad=hinge,
     )

@@ -75,17 +75,17 @@ def test_the_default_encoder_hears_a_synonym() -> None:
 
 def test_a_sentence_is_encoded_once() -> None:
     class Counting(HashEncoder):
-        seen = 0
+        encoded_count = 0
 
         def encode(self, sentences):
-            self.seen += len(sentences)
+            self.encoded_count += len(sentences)
             return super().encode(sentences)
 
     inner = Counting()
     cached = CachedEncoder(inner)
     first = cached.encode([SENTENCES[0], SENTENCES[1], SENTENCES[0]])
     np.testing.assert_array_equal(cached.encode(SENTENCES)[:2], first[:2])
-    assert inner.seen == 3
+    assert inner.encoded_count == 3
 
 
 def test_features_of_two_encoders_are_never_mixed() -> None:

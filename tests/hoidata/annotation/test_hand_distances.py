@@ -56,13 +56,13 @@ def measured(annotated: AnnotatedStore, clip_id: str) -> HandEvidence:
 
 def test_the_kept_distances_are_the_measured_ones_of_the_same_clip(annotated: AnnotatedStore) -> None:
     for clip_id in HEIGHTS_M:
-        kept, fresh = annotated.hand_evidence(clip_id), measured(annotated, clip_id)
-        assert kept.hand_type == fresh.hand_type
+        stored, fresh = annotated.hand_evidence(clip_id), measured(annotated, clip_id)
+        assert stored.hand_type == fresh.hand_type
         for side in SIDES:
-            assert kept.distance_m[side].dtype == np.float32
-            np.testing.assert_array_equal(kept.distance_m[side], fresh.distance_m[side].astype(np.float32))
-            assert kept.closest_m(side) == fresh.closest_m(side)
-        assert np.isinf(kept.distance_m["right"][-1])
+            assert stored.distance_m[side].dtype == np.float32
+            np.testing.assert_array_equal(stored.distance_m[side], fresh.distance_m[side].astype(np.float32))
+            assert stored.closest_m(side) == fresh.closest_m(side)
+        assert np.isinf(stored.distance_m["right"][-1])
 
 
 def test_another_threshold_gives_what_a_run_of_the_stage_with_it_gives(
@@ -72,8 +72,8 @@ def test_another_threshold_gives_what_a_run_of_the_stage_with_it_gives(
     for threshold_m in THRESHOLDS_M:
         annotate_store(root / "clips", tmp_path / f"{threshold_m}", encoder="hash", threshold_m=threshold_m)
         table = pd.read_parquet(tmp_path / f"{threshold_m}" / "hand_type.parquet")
-        found = table["hand_type"].astype(object).where(table["hand_type"].notna(), None)
-        whole_run = dict(zip(table["clip_id"], found, strict=True))
+        stored_types = table["hand_type"].astype(object).where(table["hand_type"].notna(), None)
+        whole_run = dict(zip(table["clip_id"], stored_types, strict=True))
         assert hand_types_at(root / "annotation", threshold_m) == whole_run
         judged = {clip_id: annotated.hand_evidence(clip_id, threshold_m).hand_type for clip_id in HEIGHTS_M}
         assert judged == whole_run

@@ -29,15 +29,15 @@ def prompts(forms: Callable) -> Iterator[tuple[str, tuple[str, str, str]]]:
 
 
 def shares(forms: Callable, named: Callable[[str], str] = str) -> np.ndarray:
-    """Share of hands, objects and verbs that read back; ``named``: what of an object's name the sentence keeps."""
+    """Return the fractions of hands, objects and verbs that read back. named: part of an object's name to compare."""
     right = []
     for sentence, (hand, noun, verb) in prompts(forms):
-        found = read_prompt(sentence)
-        by_rule = found.hand.source == "rule" and found.hand.hand == hand
-        right.append((by_rule, named(found.object_words or "") == named(noun), found.verb == verb))
-    share = np.mean(right, axis=0)
-    print(f"{forms.__name__}: {len(right):,} prompts; hand {share[0]:.2%}, object {share[1]:.2%}, verb {share[2]:.2%}")
-    return share
+        reading = read_prompt(sentence)
+        by_rule = reading.hand.source == "rule" and reading.hand.hand == hand
+        right.append((by_rule, named(reading.object_words or "") == named(noun), reading.verb == verb))
+    rate = np.mean(right, axis=0)
+    print(f"{forms.__name__}: {len(right):,} prompts; hand {rate[0]:.2%}, object {rate[1]:.2%}, verb {rate[2]:.2%}")
+    return rate
 
 
 @pytest.mark.parametrize(("dataset", "count"), [(grab, 202), (h2o, 36), (arctic, 91)], ids=["grab", "h2o", "arctic"])
@@ -46,16 +46,16 @@ def test_every_sentence_of_a_recorded_pair_reads_back(dataset, count: int) -> No
     for verb, noun in dataset.PAIRS:
         for hand in HAND_TYPES:
             for sentence in four_sentences(verb, noun, hand):
-                found = read_prompt(sentence)
-                assert (found.verb, found.object_words, found.hand.hand) == (verb, noun, hand), sentence
+                reading = read_prompt(sentence)
+                assert (reading.verb, reading.object_words, reading.hand.hand) == (verb, noun, hand), sentence
 
 
 @pytest.mark.slow
 def test_all_prompts_over_all_verbs_objects_and_hands_read_back() -> None:
     assert len(PAIRS) == 8 * 11 + 29 * 51 + 11 * 11
-    hand, thing, verb = shares(four_sentences)
+    hand, noun_accuracy, verb = shares(four_sentences)
     assert hand == 1
-    assert thing >= 0.999
+    assert noun_accuracy >= 0.999
     assert verb >= 0.99
 
 
@@ -65,13 +65,13 @@ def test_the_references_forms_read_back_but_for_the_sizes_they_leave_out() -> No
     sized = {
         noun for noun in OBJECTS.values() if reference_words(noun) in ("cube", "cylinder", "pyramid", "sphere", "torus")
     }
-    hand, thing, verb = shares(reference_sentences, lambda noun: "" if noun in sized else noun)
+    hand, noun_accuracy, verb = shares(reference_sentences, lambda noun: "" if noun in sized else noun)
     assert len(sized) == 15
-    assert (hand, thing, verb) == (1, 1, 1)
+    assert (hand, noun_accuracy, verb) == (1, 1, 1)
 
 
 @pytest.mark.parametrize(
-    ("text", "found"),
+    ("text", "expected"),
     [
         ("a train, a brain, trains", [(0, 0, 7)]),  # no part of a longer word, no plural the lexicon does not list
         ("cup-holder, big-cup, cup", [(1, 21, 24)]),
@@ -80,11 +80,11 @@ def test_the_references_forms_read_back_but_for_the_sizes_they_leave_out() -> No
         ("a b a b a", [(4, 0, 5)]),
     ],
 )
-def test_forms_are_found_as_whole_words_wherever_a_search_for_each_finds_them(text: str, found) -> None:
+def test_forms_are_matched_as_whole_words_like_a_search_for_each_form(text: str, expected) -> None:
     forms = ["a train", "cup", "cup of tea", "(x)", "a b a"]
     lexicon = Lexicon([], [(form, form) for form in forms])
     matches = [(forms.index(match.base), match.start, match.stop) for match in lexicon._nouns.matches(text)]
-    assert matches == found
+    assert matches == expected
     for number, form in enumerate(
         forms
     ):  # the plain way: every place of the form that no letter, digit or hyphen touches
@@ -116,8 +116,8 @@ def test_a_form_that_stands_for_two_words_is_refused() -> None:
     ],
 )
 def test_a_purpose_and_a_phrase_name_the_verb(text: str, verb: str, noun: str) -> None:
-    found = read_prompt(text)
-    assert (found.verb, found.object_words) == (verb, noun)
+    reading = read_prompt(text)
+    assert (reading.verb, reading.object_words) == (verb, noun)
 
 
 @pytest.mark.parametrize(
@@ -132,8 +132,8 @@ def test_a_purpose_and_a_phrase_name_the_verb(text: str, verb: str, noun: str) -
     ],
 )
 def test_a_hand_of_no_side_is_neither_the_object_nor_a_verb(text: str) -> None:
-    found = read_prompt(text)
-    assert (found.verb, found.object_words) == ("lift", "mug")
+    reading = read_prompt(text)
+    assert (reading.verb, reading.object_words) == ("lift", "mug")
 
 
 @pytest.mark.parametrize("text", ["Lift the hand with the right hand.", "Lift a hand.", "Lift the hand with one hand."])

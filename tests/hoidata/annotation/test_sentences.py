@@ -1,4 +1,4 @@
-"""Sentences in the paper's four forms, right in article, agreement, particle, plural and mass nouns."""
+"""Sentences in the forms of the paper, correct in article, agreement, particle, plural and mass nouns."""
 
 import csv
 import re
@@ -22,10 +22,10 @@ from hoidata.errors import BadInput
 
 def table_rows(kind: str) -> list[dict[str, str]]:
     text = files("hoidata.annotation").joinpath("grammar.csv").read_text(encoding="utf-8")
-    return [row for row in csv.DictReader(text.splitlines()) if row["kind"] == kind]
+    return [entry for entry in csv.DictReader(text.splitlines()) if entry["kind"] == kind]
 
 
-def test_the_four_forms_are_those_of_the_paper() -> None:
+def test_the_forms_are_those_of_the_paper() -> None:
     assert four_sentences("place", "book", "both") == (
         "Place a book with both hands.",
         "A book is placed by both hands.",
@@ -124,38 +124,40 @@ def test_sentences_of_unknown_words_follow_the_rules(verb: str, words: str, expe
 
 def test_every_verb_and_object_of_the_table_stands_in_its_sentences_as_written() -> None:
     phrases = default_phrases()
-    for row in table_rows("verb"):
-        if (row["base"], "*") in phrases.verbs:
+    for entry in table_rows("verb"):
+        if (entry["base"], "*") in phrases.verbs:
             continue
-        sentences = four_sentences(row["base"], "box", "left")
-        assert sentences[0].lower().startswith(row["base"] + " a box")
-        assert f" is {row['past_participle']} by the left hand." in sentences[1]
-        assert sentences[2] == f"The left hand {row['third_singular']} a box."
-        assert sentences[3].lower().startswith(row["gerund"] + " a box")
-    for row in table_rows("object"):
-        sentences = four_sentences("lift", row["base"], "both")
-        is_phrase = row["base"] in phrases.nouns
-        words = phrases.nouns[row["base"]].format(row["base"]) if is_phrase else row["noun_phrase"]
+        sentences = four_sentences(entry["base"], "box", "left")
+        assert sentences[0].lower().startswith(entry["base"] + " a box")
+        assert f" is {entry['past_participle']} by the left hand." in sentences[1]
+        assert sentences[2] == f"The left hand {entry['third_singular']} a box."
+        assert sentences[3].lower().startswith(entry["gerund"] + " a box")
+    for entry in table_rows("object"):
+        sentences = four_sentences("lift", entry["base"], "both")
+        is_phrase = entry["base"] in phrases.nouns
+        words = phrases.nouns[entry["base"]].format(entry["base"]) if is_phrase else entry["noun_phrase"]
         assert sentences[2] == f"Both hands lift {words}."
-        assert (" are " if row["number"] == "plural" and not is_phrase else " is ") in sentences[1]
+        assert (" are " if entry["number"] == "plural" and not is_phrase else " is ") in sentences[1]
 
 
-def without_own_row(row: dict[str, str]) -> Grammar:
-    """The shipped grammar with the one row masked."""
+def without_entry(entry: dict[str, str]) -> Grammar:
+    """The shipped grammar without one entry."""
     whole = default_grammar()
-    verbs = {base: forms for base, forms in whole.verbs.items() if (row["kind"], row["base"]) != ("verb", base)}
-    nouns = {base: noun for base, noun in whole.nouns.items() if (row["kind"], row["base"]) != ("object", base)}
+    verbs = {base: forms for base, forms in whole.verbs.items() if (entry["kind"], entry["base"]) != ("verb", base)}
+    nouns = {base: noun for base, noun in whole.nouns.items() if (entry["kind"], entry["base"]) != ("object", base)}
     return Grammar(verbs, nouns)
 
 
-@pytest.mark.parametrize("masked", [without_own_row, lambda row: Grammar({}, {})], ids=["own row", "whole table"])
+@pytest.mark.parametrize("masked", [without_entry, lambda entry: Grammar({}, {})], ids=["entry", "whole table"])
 def test_with_its_rows_masked_the_rules_agree_with_nearly_the_whole_table(masked) -> None:
     """At least 97 %; verbs miss "used to take a picture with", objects are taken for countable where English wavers."""
     verbs = {
-        (row["base"], name): getattr(masked(row).verb(row["base"]), name) == row[name]
-        for row in table_rows("verb") for name in ("gerund", "past_participle", "third_singular")
+        (entry["base"], name): getattr(masked(entry).verb(entry["base"]), name) == entry[name]
+        for entry in table_rows("verb") for name in ("gerund", "past_participle", "third_singular")
     }  # fmt: skip
-    phrases = {row["base"]: masked(row).noun(row["base"]).words == row["noun_phrase"] for row in table_rows("object")}
+    phrases = {
+        entry["base"]: masked(entry).noun(entry["base"]).words == entry["noun_phrase"] for entry in table_rows("object")
+    }
     missed = [key for cells in (verbs, phrases) for key, right in cells.items() if not right]
     print(f"verb cells {sum(verbs.values())} of {len(verbs)}, article cells {sum(phrases.values())} of {len(phrases)}")
     assert (len(verbs), len(phrases)) == (3 * len(table_rows("verb")), len(table_rows("object")))
@@ -185,9 +187,9 @@ def test_a_verb_nobody_knows_is_regular(verb: str, forms: tuple[str, str, str]) 
 
 
 def test_the_number_rule_knows_plurals_from_singulars_in_s() -> None:
-    rows = [row for row in table_rows("object") if row["number"] != "mass"]
+    rows = [entry for entry in table_rows("object") if entry["number"] != "mass"]
     empty = Grammar({}, {})
-    right = [empty.noun(row["base"]).number == row["number"] for row in rows]
+    right = [empty.noun(entry["base"]).number == entry["number"] for entry in rows]
     assert sum(right) >= 0.97 * len(right)
 
 
@@ -224,7 +226,7 @@ def _particle(verb: str) -> str:
 
 
 def _check_article(words: str, noun: str) -> None:
-    """An article by sound before one thing; none before mass nouns, plurals and nouns that bring a determiner."""
+    """An article by sound before a singular noun; none before mass nouns, plurals and nouns that bring a determiner."""
     if words == noun:
         head = noun.split()[-1]
         bare = noun in MASS or head in MASS or head in mass_nouns() or noun.split()[0] in DETERMINERS
@@ -233,8 +235,8 @@ def _check_article(words: str, noun: str) -> None:
         assert words == f"{'an' if VOWEL_BY_SOUND.match(noun) else 'a'} {noun}"
 
 
-PLURAL = {row["base"] for row in table_rows("object") if row["number"] == "plural"}
-MASS = {row["base"] for row in table_rows("object") if row["number"] == "mass"}
+PLURAL = {entry["base"] for entry in table_rows("object") if entry["number"] == "plural"}
+MASS = {entry["base"] for entry in table_rows("object") if entry["number"] == "mass"}
 
 
 @pytest.mark.parametrize("words", ["", "  ", "--"])
@@ -244,7 +246,7 @@ def test_a_sentence_without_an_object_is_refused(words: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("verb", "thing", "hand", "expected"),
+    ("verb", "object_words", "hand", "expected"),
     [
         ("place", "book", "both", ("Place book with both hands.", "Book is placed with both hands.",
                                    "Both hands place book.", "Placing book with both hands.")),
@@ -260,5 +262,5 @@ def test_a_sentence_without_an_object_is_refused(words: str) -> None:
             "Right hand takes picture camera.", "Taking picture camera with right hand.")),
     ],
 )  # fmt: skip
-def test_reference_sentences_are_the_references_without_its_misspellings(verb, thing, hand, expected) -> None:
-    assert reference_sentences(verb, thing, hand) == expected
+def test_reference_sentences_are_the_references_without_its_misspellings(verb, object_words, hand, expected) -> None:
+    assert reference_sentences(verb, object_words, hand) == expected

@@ -55,18 +55,18 @@ def annotated(root: Path) -> AnnotatedStore:
     return load_annotated(root)
 
 
-def test_reference_forms_are_written_where_asked_for(root: Path, tmp_path: Path, annotated: AnnotatedStore) -> None:
+def test_reference_forms_are_written_on_request(root: Path, tmp_path: Path, annotated: AnnotatedStore) -> None:
     for folder in ("clips", "contact", "splits"):
         (tmp_path / folder).symlink_to(root / folder)
     annotate_store(root / "clips", tmp_path / "annotation", encoder="hash", forms="reference")
-    found = load_annotated(tmp_path)
-    said = {"toy/s1/1": ("lift", "box", "left"), "toy/s2/2": ("take out", "milk", "right")}
-    assert all(found.sentences(key) == reference_sentences(*words) for key, words in said.items())
-    assert found.annotation_info["forms"] == "reference"
-    assert found.ids() == annotated.ids()
+    reloaded = load_annotated(tmp_path)
+    words_by_clip = {"toy/s1/1": ("lift", "box", "left"), "toy/s2/2": ("take out", "milk", "right")}
+    assert all(reloaded.sentences(key) == reference_sentences(*words) for key, words in words_by_clip.items())
+    assert reloaded.annotation_info["forms"] == "reference"
+    assert reloaded.ids() == annotated.ids()
 
 
-def test_sentences_name_the_hand_that_was_found(annotated: AnnotatedStore) -> None:
+def test_sentences_name_the_active_hand(annotated: AnnotatedStore) -> None:
     assert annotated.sentences("toy/s1/1")[2] == "The left hand lifts a box."
     assert annotated.sentences("toy/s2/2")[1] == "A carton of milk is taken out by the right hand."
     assert annotated.sentences("toy/s3/3")[0] == "Open a notebook with both hands."
@@ -76,7 +76,7 @@ def test_sentences_name_the_hand_that_was_found(annotated: AnnotatedStore) -> No
 def test_a_clip_without_an_acting_hand_is_listed_with_its_reason_and_left_out(annotated: AnnotatedStore) -> None:
     assert "toy/s4/4" not in annotated.ids()
     assert "no joint within 2 cm" in annotated.hand_types.at["toy/s4/4", "reason"]
-    with pytest.raises(KeyError, match="no hand acts"):
+    with pytest.raises(KeyError, match="no active hand"):
         annotated.hand_type("toy/s4/4")
     assert annotated.annotation_info["counts"]["left_out"] == 1
 
@@ -95,27 +95,27 @@ def test_the_labelled_hand_is_kept_beside_the_found_one(annotated: AnnotatedStor
     assert annotated.hand_types.at["toy/s1/1", "min_left_m"] == pytest.approx(0.01, abs=1e-3)
 
 
-def test_the_annotators_hand_is_taken_where_it_is_wanted_named_and_tracked(tmp_path: Path) -> None:
+def test_the_labelled_hand_is_used_if_requested_and_tracked(tmp_path: Path) -> None:
     """Clip 3: both come near, the left is named. Clip 4: named, but none comes near. Clip 5: the left is never seen."""
     away = clip(4, NOTEBOOK, False, False, labelled_hand="left")
     unseen = clip(5, BOX, False, True, labelled_hand="both")
     left = replace(unseen.hands["left"], valid=np.zeros(FRAMES, bool))
     unseen = replace(unseen, hands={**unseen.hands, "left": left})
     rule = {"by": "subject", "train": "rest", "test": ["s3"]}
-    found = load_annotated(
+    annotated = load_annotated(
         write_annotated(tmp_path, [*clips()[:3], away, unseen], rule=rule, hand="annotated-else-proximity")
     )
-    said = found.hand_types[["hand_type", "source"]].fillna("none")
-    assert said["hand_type"].tolist() == ["left", "right", "left", "none", "right"]
-    assert said["source"].tolist() == ["proximity", "annotated", "annotated", "none", "proximity"]
-    assert found.hand_types["agreement"].tolist() == [None, True, False, False, False]
-    assert found.sentences("toy/s3/3")[0] == "Open a notebook with the left hand."
-    (sample,) = HoiDataset(found, "test")
+    hand_types = annotated.hand_types[["hand_type", "source"]].fillna("none")
+    assert hand_types["hand_type"].tolist() == ["left", "right", "left", "none", "right"]
+    assert hand_types["source"].tolist() == ["proximity", "annotated", "annotated", "none", "proximity"]
+    assert annotated.hand_types["agreement"].tolist() == [None, True, False, False, False]
+    assert annotated.sentences("toy/s3/3")[0] == "Open a notebook with the left hand."
+    (sample,) = HoiDataset(annotated, "test")
     assert sample.active_hands.tolist() == [True, False]
-    np.testing.assert_array_equal(sample.contact[0], found.contact_of("toy/s3/3", "left"))
+    np.testing.assert_array_equal(sample.contact[0], annotated.contact_of("toy/s3/3", "left"))
     assert not sample.contact[1].any()
-    assert found.annotation_info["hand"] == "annotated-else-proximity"
-    counts = found.annotation_info["counts"]
+    assert annotated.annotation_info["hand"] == "annotated-else-proximity"
+    counts = annotated.annotation_info["counts"]
     assert (counts["labelled"], counts["agreeing"], counts["left"], counts["both"]) == (4, 1, 2, 0)
 
 
@@ -139,10 +139,10 @@ def test_features_are_those_of_the_sentences(annotated: AnnotatedStore) -> None:
 
 def test_points_come_back_as_they_were_sampled(annotated: AnnotatedStore) -> None:
     for key in ("box", "notebook"):
-        stored, made = annotated.points(key), sample_points(annotated.object_model(key))
-        assert stored.method == made.method
+        stored, sampled = annotated.points(key), sample_points(annotated.object_model(key))
+        assert stored.method == sampled.method
         for name in ("points_m", "normals", "face", "barycentric", "part"):
-            np.testing.assert_array_equal(getattr(stored, name), getattr(made, name))
+            np.testing.assert_array_equal(getattr(stored, name), getattr(sampled, name))
 
 
 def test_distances_and_contact_equal_brute_force_from_the_stored_clip(annotated: AnnotatedStore) -> None:
@@ -168,9 +168,9 @@ def test_distances_and_contact_equal_brute_force_from_the_stored_clip(annotated:
 def test_both_hands_are_told_apart_in_the_distances(annotated: AnnotatedStore) -> None:
     both = annotated.distances("toy/s3/3")
     for number, side in enumerate(SIDES):
-        own = annotated.distances("toy/s3/3", side)
-        assert set(own.side.tolist()) == {number}
-        np.testing.assert_array_equal(both.select(both.side == number).point, own.point)
+        side_entries = annotated.distances("toy/s3/3", side)
+        assert set(side_entries.side.tolist()) == {number}
+        np.testing.assert_array_equal(both.select(both.side == number).point, side_entries.point)
     assert (annotated.distances("toy/s1/1").side == 0).all()
 
 
@@ -210,14 +210,14 @@ def test_a_missing_stage_is_named(root: Path, tmp_path: Path) -> None:
             load_annotated(tmp_path)
 
 
-def test_a_clip_in_which_no_hand_acts_gets_no_verb_from_its_motion(tmp_path: Path) -> None:
+def test_a_clip_without_an_active_hand_gets_no_derived_verb(tmp_path: Path) -> None:
     root = write_annotated(tmp_path, [*clips(), clip(5, NOTEBOOK, False, False, verb=None)])
-    found = pd.read_parquet(root / "annotation" / "hand_type.parquet").set_index("clip_id")
-    assert found["verb_source"].fillna("none").tolist() == ["source", "source", "derived", "source", "none"]
-    assert found.loc["toy/s5/5", ["verb", "verb_evidence"]].isna().all()
+    hand_types = pd.read_parquet(root / "annotation" / "hand_type.parquet").set_index("clip_id")
+    assert hand_types["verb_source"].fillna("none").tolist() == ["source", "source", "derived", "source", "none"]
+    assert hand_types.loc["toy/s5/5", ["verb", "verb_evidence"]].isna().all()
 
 
-def test_a_threshold_that_is_no_length_is_refused(root: Path, tmp_path: Path) -> None:
+def test_a_threshold_that_is_not_positive_is_refused(root: Path, tmp_path: Path) -> None:
     for wrong in (0.0, -0.02, float("nan")):
         with pytest.raises(BadInput, match="metres above 0"):
             annotate_store(root / "clips", tmp_path / "annotation", encoder="hash", threshold_m=wrong)
@@ -226,7 +226,7 @@ def test_a_threshold_that_is_no_length_is_refused(root: Path, tmp_path: Path) ->
 def test_a_clip_that_failed_quality_control_has_its_reason_and_no_sentence(root: Path, tmp_path: Path) -> None:
     (tmp_path / "clips").symlink_to(root / "clips")
     failed = {"toy/s1/1": "left out by quality control: a jump"}
-    counts = annotate_store(tmp_path / "clips", tmp_path / "annotation", encoder="hash", left_out=failed)
+    counts = annotate_store(tmp_path / "clips", tmp_path / "annotation", encoder="hash", excluded=failed)
     (tmp_path / "contact").symlink_to(root / "contact")
     split_store(tmp_path / "clips", tmp_path / "annotation", tmp_path / "splits", BY_SUBJECT)
     left = load_annotated(tmp_path)

@@ -68,7 +68,13 @@ class Clips:
         frames = np.arange(self.clips[clip_id].n_frames)
         both = [np.concatenate((frames, frames)) for _ in range(3)]
         side = np.repeat([0, 1], len(frames))
-        return DistanceEntries(side, both[0], both[1] % 21, both[2], np.full(2 * len(frames), 0.01, np.float32))
+        return DistanceEntries(
+            side=side,
+            frame=both[0],
+            joint=both[1] % 21,
+            point=both[2],
+            distance_m=np.full(2 * len(frames), 0.01, np.float32),
+        )
 
 
 @pytest.fixture(scope="module")
@@ -92,10 +98,10 @@ def test_the_shape_of_a_hand_is_the_mean_over_frames_in_which_it_is_tracked():
 def test_a_hand_holds_its_last_tracked_pose_and_keeps_the_mask(valid, shown):
     flags = np.array([flag == "1" for flag in valid])
     track = replace(random_hand(5, betas_rows=5), valid=flags)
-    held = track.held()
+    filled = track.with_last_valid_pose()
     for name in ("wrist_m", "global_orient", "hand_pose", "betas"):
-        np.testing.assert_array_equal(getattr(held, name), getattr(track, name)[shown])
-    np.testing.assert_array_equal(held.valid, flags)
+        np.testing.assert_array_equal(getattr(filled, name), getattr(track, name)[shown])
+    np.testing.assert_array_equal(filled.valid, flags)
 
 
 def test_a_sample_goes_back_to_the_world_it_came_from(clips: Clips) -> None:
@@ -154,11 +160,11 @@ def test_the_contact_stages_threshold_decides_what_is_touched_whole_and_cropped(
 def test_random_crops_repeat_with_the_seed_and_reach_the_last_window(clips: Clips) -> None:
     def starts(seed: int) -> list[int]:
         dataset = HoiDataset(clips, "train", 28, seed=seed)
-        found = []
+        crops = []
         for epoch in range(30):
             dataset.set_epoch(epoch)
-            found.append(dataset[0].start)
-        return found
+            crops.append(dataset[0].start)
+        return crops
 
     assert starts(1) == starts(1)
     assert starts(1) != starts(2)
@@ -186,9 +192,9 @@ def test_collate_pads_with_zeros_and_masks_what_is_missing(clips: Clips) -> None
 def test_a_batch_reads_only_the_entries_of_the_frames_it_chose(clips: Clips) -> None:
     samples = list(HoiDataset(clips, "train"))
     frames = np.array([[0, 29], [3, 4], [7, 44]])
-    clip, side, place, joint, point = collate(samples, Sight(frames)).entries.T
+    clip, side, frame_index, joint, point = collate(samples, Sight(frames)).entries.T
     assert point.tolist() == frames.flatten().tolist()
-    assert (clip.tolist(), place.tolist()) == ([0, 0, 1, 1, 2, 2], [0, 1] * 3)
+    assert (clip.tolist(), frame_index.tolist()) == ([0, 0, 1, 1, 2, 2], [0, 1] * 3)
     assert (joint.tolist(), set(side.tolist())) == ((point % 21).tolist(), {1})
 
 
@@ -213,11 +219,11 @@ def test_personal_templates_come_along_or_are_refused_in_a_mixture(clips: Clips)
     pair = load_embedded_hands()
     whole = clips.clip("toy/s1/0")
     hands = {side: replace(track, template_m=pair[side].template_m) for side, track in whole.hands.items()}
-    own = HoiDataset(Clips({"toy/s1/0": replace(whole, hands=hands)}), "train")[0]
-    assert own.template_m is not None
-    batch = collate([own])
+    personal = HoiDataset(Clips({"toy/s1/0": replace(whole, hands=hands)}), "train")[0]
+    assert personal.template_m is not None
+    batch = collate([personal])
     assert batch.template_m is not None
     expected = np.stack([pair.left.template_m, pair.right.template_m])[None]
     np.testing.assert_allclose(batch.template_m.numpy(), expected, atol=1e-6)
     with pytest.raises(BadInput, match="mixture"):
-        collate([own, HoiDataset(clips, "train")[1]])
+        collate([personal, HoiDataset(clips, "train")[1]])

@@ -33,19 +33,19 @@ def per_frame(clip: Clip) -> dict[str, np.ndarray]:
 
 
 def test_every_array_is_cut_to_the_same_frames(cuts):
-    seen = set()
+    field_names = set()
     for whole, part in cuts:
         before, after = per_frame(whole), per_frame(part)
         assert list(before) == list(after)
         for name, array in before.items():
             assert len(array) == whole.n_frames
             np.testing.assert_array_equal(after[name], array[START:STOP], err_msg=name)
-        seen |= set(before)
-    some = {"left betas", "object 2 rotvec", "object 0 hinge_rad", "camera images", "body expression"}
-    assert some <= seen
+        field_names |= set(before)
+    expected_names = {"left betas", "object 2 rotvec", "object 0 hinge_rad", "camera images", "body expression"}
+    assert expected_names <= field_names
 
 
-def test_what_holds_for_all_frames_stays(cuts):
+def test_constant_fields_are_unchanged(cuts):
     for whole, part in cuts:
         assert check_clip(part) is part
         assert (part.clip_id, part.n_frames, part.source_fps) == (whole.clip_id, STOP - START, whole.source_fps)
@@ -64,7 +64,7 @@ def entries(clip: Clip) -> set[tuple[int, int, int]]:
     }
 
 
-def test_contacts_are_those_of_the_frames_counted_from_the_first_of_them(cuts):
+def test_contacts_are_selected_and_renumbered_from_the_first_frame(cuts):
     touched = [(whole, part) for whole, part in cuts if whole.source_contact is not None]
     at_the_edges = {START - 1, START, STOP - 1, STOP}
     assert at_the_edges <= {frame for whole, _ in touched for frame, _, _ in entries(whole)}
@@ -74,12 +74,14 @@ def test_contacts_are_those_of_the_frames_counted_from_the_first_of_them(cuts):
 
 
 def test_frames_may_be_taken_by_number_in_any_order_with_their_contacts(clips):
-    wanted = np.array([STOP, START, START - 1])
+    frame_numbers = np.array([STOP, START, START - 1])
     for whole in clips:
-        taken = whole.take(wanted)
+        taken = whole.take(frame_numbers)
         for name, array in per_frame(whole).items():
-            np.testing.assert_array_equal(per_frame(taken)[name], array[wanted], err_msg=name)
+            np.testing.assert_array_equal(per_frame(taken)[name], array[frame_numbers], err_msg=name)
         if whole.source_contact is not None:
-            expected = {(new, v, label) for new, old in enumerate(wanted) for f, v, label in entries(whole) if f == old}
+            expected = {
+                (new, v, label) for new, old in enumerate(frame_numbers) for f, v, label in entries(whole) if f == old
+            }
             assert entries(taken) == expected
             assert taken.source_contact.frame.dtype == whole.source_contact.frame.dtype

@@ -1,4 +1,4 @@
-"""The feature layout, held poses, slips and quarantine of clips, by formulas of their own."""
+"""The feature layout, filled poses, slip and quarantine of clips, against independent formulas."""
 
 from dataclasses import replace
 
@@ -51,10 +51,10 @@ def test_object_features_are_the_turned_pose_and_the_hinge_angle(articulated):
 @pytest.mark.parametrize("gravity", [(0, 0, -1), (0, 0, 9.81), (0, -9.81, 0), (0.3, 0.5, -0.1), (-1e-12, 0, -1)])
 def test_upright_is_the_smallest_rotation_that_turns_gravity_down(gravity):
     direction = np.array(gravity) / np.linalg.norm(gravity)
-    turn = upright(np.array(gravity))
-    np.testing.assert_allclose(turn @ direction, (0, 0, -1), atol=1e-9)
-    assert np.linalg.det(turn) == pytest.approx(1)
-    angle = Rotation.from_matrix(turn).magnitude()
+    rotation = upright(np.array(gravity))
+    np.testing.assert_allclose(rotation @ direction, (0, 0, -1), atol=1e-9)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    angle = Rotation.from_matrix(rotation).magnitude()
     assert angle == pytest.approx(np.arccos(np.clip(-direction[2], -1, 1)), abs=1e-6)
 
 
@@ -62,25 +62,25 @@ def test_upright_is_the_identity_where_gravity_is_unknown():
     np.testing.assert_array_equal(upright(None), np.eye(3))
 
 
-def test_a_held_hand_shows_the_last_valid_pose_and_stays_invalid_there():
+def test_invalid_poses_are_replaced_by_the_last_valid_one_and_stay_invalid():
     track = build_clip().hands["right"]
     valid = np.arange(30) % 3 == 1
-    held = replace(track, valid=valid).held()
-    np.testing.assert_array_equal(held.valid, valid)
-    np.testing.assert_array_equal(held.wrist_m[:6], track.wrist_m[[1, 1, 1, 1, 4, 4]])
+    filled = replace(track, valid=valid).with_last_valid_pose()
+    np.testing.assert_array_equal(filled.valid, valid)
+    np.testing.assert_array_equal(filled.wrist_m[:6], track.wrist_m[[1, 1, 1, 1, 4, 4]])
 
 
 def test_a_joint_slips_by_its_motion_over_a_part_that_moves_and_nowhere_else():
     """A box moves along x at 10 cm/s, then stands; a joint moves along y over it at 4 cm/s."""
     frames = np.arange(20)
     along_x = np.minimum(frames, 10) * 0.10 / FPS
-    place = np.stack((along_x, np.zeros(20), np.zeros(20)), axis=1)
-    track = ObjectTrack(box_model(), np.tile([0.0, 0, 0.5], (20, 1)), place, None)
-    joints = np.repeat(place[:, None], 21, axis=1) + np.array([0.0, 1, 0]) * (frames * 0.04 / FPS)[:, None, None]
+    position_m = np.stack((along_x, np.zeros(20), np.zeros(20)), axis=1)
+    track = ObjectTrack(box_model(), np.tile([0.0, 0, 0.5], (20, 1)), position_m, None)
+    joints = np.repeat(position_m[:, None], 21, axis=1) + np.array([0.0, 1, 0]) * (frames * 0.04 / FPS)[:, None, None]
     touched = np.full((20, 21), -1)
     touched[3:15, 7] = 0  # seven intervals while it moves, from frame 3 to frame 10
     np.testing.assert_allclose(joint_slips_cm_s(track, joints, touched), np.full(7, 4.0), rtol=1e-6)
-    slow = replace(track, translation_m=place * 0.9 * MOVING_CM_S / 10)
+    slow = replace(track, translation_m=position_m * 0.9 * MOVING_CM_S / 10)
     assert len(joint_slips_cm_s(slow, joints, touched)) == 0
 
 
@@ -95,17 +95,27 @@ def test_frames_of_a_recording_keep_hands_object_and_usable_together():
     clip, hand = build_clip(), mano_hand(load_embedded_hands(), "right")
     rng = np.random.default_rng(0)
     joints = len(hand.parents) if hasattr(hand, "parents") else 16
-    own = {side: OwnHandTrack(rng.normal(size=(30, 3)), rng.normal(0, 0.3, (30, joints, 3))) for side in SIDES}
+    tracks = {side: OwnHandTrack(rng.normal(size=(30, 3)), rng.normal(0, 0.3, (30, joints, 3))) for side in SIDES}
     usable = np.arange(30) != 4
-    whole = HandRecording("test", "s1", "a", 60.0, hand, own, clip.object, usable, np.array([0.0, 0, -1]))
-    some = whole.take(slice(0, 30, 2))
-    np.testing.assert_array_equal(some.usable, usable[::2])
-    np.testing.assert_array_equal(some.object.translation_m, clip.object.translation_m[::2])
+    whole = HandRecording(
+        dataset="test",
+        subject="s1",
+        sequence="a",
+        fps=60.0,
+        hand=hand,
+        hands=tracks,
+        object=clip.object,
+        usable=usable,
+        gravity=np.array([0.0, 0, -1]),
+    )
+    every_second = whole.take(slice(0, 30, 2))
+    np.testing.assert_array_equal(every_second.usable, usable[::2])
+    np.testing.assert_array_equal(every_second.object.translation_m, clip.object.translation_m[::2])
     for side in SIDES:
-        np.testing.assert_array_equal(some.hands[side].rotvec, own[side].rotvec[::2])
+        np.testing.assert_array_equal(every_second.hands[side].rotvec, tracks[side].rotvec[::2])
         wrist = whole.world_from_wrist(side)
-        turned = Rotation.from_rotvec(own[side].rotvec[:, 0]).apply(np.tile([0.1, 0.2, 0.3], (30, 1)))
+        turned = Rotation.from_rotvec(tracks[side].rotvec[:, 0]).apply(np.tile([0.1, 0.2, 0.3], (30, 1)))
         point = wrist @ np.tile([0.1, 0.2, 0.3], (30, 1, 1))
-        np.testing.assert_allclose(point[:, 0], turned + own[side].wrist_m, atol=1e-9)
+        np.testing.assert_allclose(point[:, 0], turned + tracks[side].wrist_m, atol=1e-9)
     assert whole.tracked_hand("right") is hand
     assert whole.tracked_hand("left") is not hand

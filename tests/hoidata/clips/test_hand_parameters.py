@@ -75,8 +75,8 @@ class TestTranslation:
         source = source_hand(betas=betas)
         track = to_track(source, PLAIN, model)
         for frame in range(N_FRAMES):
-            own = source.betas[0 if betas == "sequence" else frame]
-            expected = wrist_of(model, own) + source.translation_m[frame]
+            frame_betas = source.betas[0 if betas == "sequence" else frame]
+            expected = wrist_of(model, frame_betas) + source.translation_m[frame]
             np.testing.assert_allclose(track.wrist_m[frame], expected, atol=1e-6)
             assert np.linalg.norm(expected - source.translation_m[frame]) > 0.05
 
@@ -123,7 +123,7 @@ class TestFingers:
 
     @pytest.mark.parametrize("fingers", ["absolute", "mean-relative"])
     def test_angles_beyond_pi_are_the_same_rotations_stored_as_at_most_pi(self, model, fingers):
-        """The mean pose is added to the numbers as they are, not to shorter ones of the same rotation."""
+        """The mean pose is added to the axis-angles of the source, not to canonical ones."""
         source = source_hand()
         source.fingers[:, 21:24] = (0.0, 0.0, 6.6)
         track = to_track(source, replace(PLAIN, fingers=fingers), model)
@@ -161,8 +161,8 @@ class TestFrame:
         source, change = source_hand(betas="frame"), frame_change(rows)
         before, after = to_track(source, PLAIN, model), to_track(source, PLAIN, model, change)
         for frame in range(N_FRAMES):
-            row = 0 if rows == 1 else frame
-            rotation, shift = change.rotation[row], change.translation_m[row]
+            beta_index = 0 if rows == 1 else frame
+            rotation, shift = change.rotation[beta_index], change.translation_m[beta_index]
             expected = joints_as_stored(before, model, frame) @ rotation.T + shift
             np.testing.assert_allclose(joints_as_stored(after, model, frame), expected, atol=3e-6)
         np.testing.assert_array_equal(before.hand_pose, after.hand_pose)

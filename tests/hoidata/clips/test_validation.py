@@ -16,7 +16,9 @@ def with_mesh(clip, scale):
 
 def with_camera(clip, **changes):
     numbers = np.zeros((30, 3), np.float32)
-    camera = CameraTrack("cam4", numbers, numbers, np.arange(30, dtype=np.int32), np.ones(6))
+    camera = CameraTrack(
+        name="cam4", rotvec=numbers, position_m=numbers, images=np.arange(30, dtype=np.int32), intrinsics=np.ones(6)
+    )
     return replace(clip, camera=replace(camera, **changes))
 
 

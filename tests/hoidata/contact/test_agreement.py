@@ -18,11 +18,11 @@ from tests.builders.stores import write_clips
 
 
 @pytest.mark.parametrize(
-    ("made", "true", "score"),
+    ("predicted", "true", "score"),
     [([1, 1, 0, 0], [1, 0, 1, 0], 0.5), ([0, 0], [0, 0], 1.0), ([1, 1], [0, 0], 0.0), ([1, 0, 1], [1, 1, 1], 0.8)],
 )
-def test_f1_is_the_harmonic_mean_of_precision_and_recall(made, true, score):
-    assert f1_score(np.array(made, dtype=bool), np.array(true, dtype=bool)) == pytest.approx(score)
+def test_f1_is_the_harmonic_mean_of_precision_and_recall(predicted, true, score):
+    assert f1_score(np.array(predicted, dtype=bool), np.array(true, dtype=bool)) == pytest.approx(score)
 
 
 def test_the_settings_of_an_output_are_read_from_it(tmp_path):

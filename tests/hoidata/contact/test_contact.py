@@ -28,7 +28,7 @@ def scene(request: pytest.FixtureRequest) -> tuple[Clip, Joints, SampledPoints]:
     points = random.uniform(-0.08, 0.08, (POINTS, 3)).astype(np.float32)
     part = (points[:, 0] > 0).astype(np.uint8) if request.param else np.zeros(POINTS, np.uint8)
     hinge = Hinge(np.array([0.0, 0.6, 0.8]), np.array([0.01, -0.02, 0.03])) if request.param else None
-    model = ObjectModel("cloud", points, np.arange(POINTS).reshape(-1, 3), part, hinge)
+    model = ObjectModel(name="cloud", vertices_m=points, faces=np.arange(POINTS).reshape(-1, 3), part=part, hinge=hinge)
     angle = np.linspace(-2.0, 1.5, FRAMES) if request.param else None
     track = ObjectTrack(model, random.normal(size=(FRAMES, 3)), random.normal(size=(FRAMES, 3)), angle)
     clip = clip_of("toy/s1/1", track)
@@ -82,9 +82,12 @@ def test_hand_evidence_equals_brute_force(scene: tuple[Clip, Joints, SampledPoin
 
 def test_nothing_changes_when_the_world_turns_and_shifts(scene: tuple[Clip, Joints, SampledPoints]) -> None:
     clip, joints, points = scene
-    turn, shift = Rotation.from_rotvec((0.4, -1.1, 0.7)), np.array([1.0, -2.0, 0.5])
-    other_clip = in_another_world(clip, turn, shift)
-    other_joints = {side: turn.apply(own.reshape(-1, 3)).reshape(own.shape) + shift for side, own in joints.items()}
+    rotation, shift = Rotation.from_rotvec((0.4, -1.1, 0.7)), np.array([1.0, -2.0, 0.5])
+    other_clip = in_another_world(clip, rotation, shift)
+    other_joints = {
+        side: rotation.apply(side_joints.reshape(-1, 3)).reshape(side_joints.shape) + shift
+        for side, side_joints in joints.items()
+    }
     index = ProximityIndex(points)
     before, after = distance_entries(clip, joints, index), distance_entries(other_clip, other_joints, index)
     for side in SIDES:

@@ -19,7 +19,14 @@ Scene = tuple[SampledPoints, ObjectTrack, np.ndarray]
 
 def sampled(points_m: np.ndarray, part: np.ndarray) -> SampledPoints:
     nothing = np.zeros((len(points_m), 3), np.float32)
-    return SampledPoints(points_m.astype(np.float32), nothing, np.zeros(len(part)), nothing, part, "surface-fps")
+    return SampledPoints(
+        points_m=points_m.astype(np.float32),
+        normals=nothing,
+        face=np.zeros(len(part)),
+        barycentric=nothing,
+        part=part,
+        method="surface-fps",
+    )
 
 
 def scene(seed: int, n_points: int, articulated: bool, spread_m: float) -> Scene:
@@ -28,7 +35,7 @@ def scene(seed: int, n_points: int, articulated: bool, spread_m: float) -> Scene
     points = random.uniform(-0.09, 0.09, (n_points, 3)) * random.uniform(0, 1, 3)
     part = (points[:, 0] > 0).astype(np.uint8) if articulated else np.zeros(n_points, np.uint8)
     hinge = Hinge(np.array([0.0, 0.6, 0.8]), np.array([0.01, -0.02, 0.03])) if articulated else None
-    model = ObjectModel("cloud", points, np.zeros((1, 3), np.int64), part, hinge)
+    model = ObjectModel(name="cloud", vertices_m=points, faces=np.zeros((1, 3), np.int64), part=part, hinge=hinge)
     angle = random.uniform(-2, 2, FRAMES) if articulated else None
     track = ObjectTrack(model, random.normal(size=(FRAMES, 3)), random.normal(size=(FRAMES, 3)), angle)
     joints = track.translation_m[:, None] + random.normal(0, spread_m, (FRAMES, JOINTS, 3))
@@ -40,25 +47,25 @@ def by_part(
 ) -> list[tuple[np.ndarray, KDTree, np.ndarray]]:
     """Per part its rows, a tree of its points, and the joints in its frame."""
     in_object = track.world_from_object.inverse() @ joints.astype(np.float64)
-    found = []
+    parts = []
     for part in np.unique(points.part):
         rows = np.flatnonzero(points.part == part)
         local = track.model.object_from_part(int(part), track.hinge_rad).inverse() @ in_object
-        found.append((rows, KDTree(points.points_m[rows].astype(np.float64)), local))
-    return found
+        parts.append((rows, KDTree(points.points_m[rows].astype(np.float64)), local))
+    return parts
 
 
-def entries_from_trees(given: Scene, valid: np.ndarray, threshold_m: float) -> np.ndarray:
+def entries_from_trees(scene_data: Scene, valid: np.ndarray, threshold_m: float) -> np.ndarray:
     """One tree per part and one of the joints, sorted afterwards."""
-    found = [np.zeros(0, ENTRY)]
-    for rows, tree, local in by_part(*given):
+    pieces = [np.zeros(0, ENTRY)]
+    for rows, tree, local in by_part(*scene_data):
         near = KDTree(local.reshape(-1, 3)).sparse_distance_matrix(tree, threshold_m, output_type="ndarray")
         near = near[near["v"] < threshold_m]
         entries = np.zeros(len(near), ENTRY)
         entries["frame"], entries["joint"] = np.divmod(near["i"], JOINTS)
         entries["point"], entries["distance_m"] = rows[near["j"]], near["v"]
-        found.append(entries[valid[entries["frame"]]])
-    entries = np.concatenate(found)
+        pieces.append(entries[valid[entries["frame"]]])
+    entries = np.concatenate(pieces)
     return entries[np.lexsort((entries["joint"], entries["point"], entries["frame"]))]
 
 
@@ -70,11 +77,11 @@ def entries_from_trees(given: Scene, valid: np.ndarray, threshold_m: float) -> n
 def test_entries_are_those_of_trees_bit_for_bit_and_in_order(
     seed, n_points, articulated, threshold_m, spread_m
 ) -> None:
-    given = scene(seed, n_points, articulated, spread_m)
-    points, track, joints = given
+    scene_data = scene(seed, n_points, articulated, spread_m)
+    points, track, joints = scene_data
     valid = np.random.default_rng(seed).random(FRAMES) < 0.8
-    found = ProximityIndex(points).entries(joints, valid, track, threshold_m)
-    assert found.tobytes() == entries_from_trees(given, valid, threshold_m).tobytes()
+    entries = ProximityIndex(points).entries(joints, valid, track, threshold_m)
+    assert entries.tobytes() == entries_from_trees(scene_data, valid, threshold_m).tobytes()
 
 
 @given(st.integers(0, 2**32), st.integers(1, 600), st.booleans(), st.sampled_from([0.0, 0.03, 0.3, 5.0]))
@@ -124,7 +131,7 @@ def test_without_points_nothing_is_near_and_all_is_infinitely_far() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shape", "n_points", "what"),
+    ("shape", "n_points", "message"),
     [
         ((32768, 1), 3, "at most 32767 frames"),
         ((1, 128), 3, "at most 127 joints"),
@@ -132,9 +139,9 @@ def test_without_points_nothing_is_near_and_all_is_infinitely_far() -> None:
     ],
     ids=["frames", "joints", "points"],
 )
-def test_what_an_entry_cannot_count_is_refused(shape: tuple[int, int], n_points: int, what: str) -> None:
+def test_numbers_beyond_the_range_of_an_entry_are_refused(shape: tuple[int, int], n_points: int, message: str) -> None:
     index = ProximityIndex(sampled(np.zeros((n_points, 3)), np.zeros(n_points, np.uint8)))
     model = ObjectModel("dot", np.zeros((1, 3)), np.zeros((1, 3), np.int64), np.zeros(1, np.uint8))
     track = ObjectTrack(model, np.zeros((shape[0], 3)), np.zeros((shape[0], 3)))
-    with pytest.raises(BadInput, match=what):
+    with pytest.raises(BadInput, match=message):
         index.entries(np.zeros((*shape, 3)), np.ones(shape[0], bool), track)

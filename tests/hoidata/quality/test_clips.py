@@ -1,4 +1,4 @@
-"""A fault planted into a good clip raises its own measure over its limit, and the others stay where they were."""
+"""A fault in a good clip raises its measure over the limit and leaves the others unchanged."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -36,11 +36,11 @@ def row(clip: Clip, thresholds: Thresholds | None = None) -> dict:
 
 def over_limit(measured: dict) -> dict[str, str]:
     """Verdict by measure, of those over a limit."""
-    found = {}
+    verdicts = {}
     for measure in CLIP_MEASURES:
         for finding in findings({**measured, "beta_distance": np.nan}, [measure], DEFAULT_LIMITS):
-            found[measure.name] = finding.verdict
-    return found
+            verdicts[measure.name] = finding.verdict
+    return verdicts
 
 
 @pytest.fixture
@@ -53,9 +53,9 @@ def noise(sigma: float, *shape: int) -> np.ndarray:
 
 
 def from_frame_30(values: np.ndarray, change) -> np.ndarray:
-    found = values.copy()
-    found[30:] += change
-    return found
+    changed = values.copy()
+    changed[30:] += change
+    return changed
 
 
 def no_hand(clip: Clip) -> Clip:
@@ -133,31 +133,33 @@ def test_jump_says_between_which_frames_it_is(good):
     assert finding.reason.endswith("m at frame 29, above 0.3 m")
 
 
-HELD = np.r_[np.clip(np.arange(29), None, 9), np.arange(29, FRAMES)]  # still in frames 9 to 28
+STILL_FRAMES = np.r_[np.clip(np.arange(29), None, 9), np.arange(29, FRAMES)]  # still in frames 9 to 28
 
 
-def test_one_frozen_hand_and_a_frozen_recording_are_told_apart(good):
-    pose = {"rotvec": good.object.rotvec[HELD], "translation_m": good.object.translation_m[HELD]}
-    hands = {side: _held(track, HELD) for side, track in good.hands.items()}
-    one, every = (
+def test_one_frozen_hand_and_a_frozen_recording_are_distinguished(good):
+    pose = {"rotvec": good.object.rotvec[STILL_FRAMES], "translation_m": good.object.translation_m[STILL_FRAMES]}
+    hands = {side: _frozen(track, STILL_FRAMES) for side, track in good.hands.items()}
+    one, both = (
         replace(good, hands={**good.hands, "right": hands["right"]}),
         replace(with_object(good, **pose), hands=hands),
     )
-    found = [(row(clip)["frozen_hand_frames"], row(clip)["frozen_all_frames"]) for clip in (one, every)]
-    assert found == [(20, 0), (0, 20)]
+    frozen_frames = [(row(clip)["frozen_hand_frames"], row(clip)["frozen_all_frames"]) for clip in (one, both)]
+    assert frozen_frames == [(20, 0), (0, 20)]
 
 
 def test_a_hand_is_frozen_while_only_the_other_one_moves(good):
     still = {"rotvec": good.object.rotvec[:1].repeat(FRAMES, 0), "translation_m": np.zeros((FRAMES, 3), np.float32)}
-    clip = with_object(replace(good, hands={**good.hands, "right": _held(good.hands["right"], HELD)}), **still)
+    clip = with_object(
+        replace(good, hands={**good.hands, "right": _frozen(good.hands["right"], STILL_FRAMES)}), **still
+    )
     assert row(clip)["frozen_hand_frames"] == 20
 
 
 def test_nothing_is_frozen_while_another_object_or_the_lid_moves(make_clip):
     clip = make_clip(n_frames=FRAMES, articulated=True, seed=3)
     moving = clip.object
-    pose = {"rotvec": moving.rotvec[HELD], "translation_m": moving.translation_m[HELD]}
-    hands = {side: _held(track, HELD) for side, track in clip.hands.items()}
+    pose = {"rotvec": moving.rotvec[STILL_FRAMES], "translation_m": moving.translation_m[STILL_FRAMES]}
+    hands = {side: _frozen(track, STILL_FRAMES) for side, track in clip.hands.items()}
     closed = replace(with_object(clip, **pose, hinge_rad=np.zeros(FRAMES, np.float32)), hands=hands)
     assert row(closed)["frozen_all_frames"] == 20
     assert row(replace(closed, other_objects=(moving,)))["frozen_all_frames"] == 0
@@ -173,9 +175,9 @@ def test_one_hand_is_enough(good):
     assert (measured["left_invalid_share"], measured["right_invalid_share"]) == (0.5, 0.5)
 
 
-def _held(track, held):
+def _frozen(track, source_frames):
     names = ("wrist_m", "global_orient", "hand_pose")
-    return replace(track, **{name: getattr(track, name)[held] for name in names})
+    return replace(track, **{name: getattr(track, name)[source_frames] for name in names})
 
 
 def test_late_hands_are_found_with_their_lag(make_clip):
@@ -227,7 +229,7 @@ def test_penetration_looks_at_every_nth_frame_from_the_first_on(good):
     wrist = good.hands["right"].wrist_m.copy()
     wrist[7] = good.object.translation_m[7]
     clip = with_hand(good, wrist_m=wrist)
-    depths = [row(clip, Thresholds(penetration_every=every))["penetration_m"] for every in (7, 2)]
+    depths = [row(clip, Thresholds(penetration_every=stride))["penetration_m"] for stride in (7, 2)]
     assert depths[0] > 0.02
     assert depths[1] < 0.01
 
@@ -236,9 +238,9 @@ def test_a_hand_that_is_not_seen_penetrates_nothing(make_clip):
     """What a frame without the hand holds means nothing, wherever it lies."""
     clip = sunken_hand(make_clip(n_frames=11))
     valid = np.arange(11) >= 5  # measured in frames 0, 5 and 10
-    some, none = row(with_hand(clip, valid=valid)), row(with_hand(clip, valid=np.zeros(11, bool)))
-    assert some["penetration_share"] == pytest.approx(2 / 3)
-    assert (none["penetration_m"], none["penetration_share"]) == (0, 0)
+    partly_valid, never_valid = row(with_hand(clip, valid=valid)), row(with_hand(clip, valid=np.zeros(11, bool)))
+    assert partly_valid["penetration_share"] == pytest.approx(2 / 3)
+    assert (never_valid["penetration_m"], never_valid["penetration_share"]) == (0, 0)
 
 
 def test_object_measures_are_those_of_its_worst_part(make_clip):
@@ -275,9 +277,9 @@ def test_verdict_follows_from_the_limits(value, limit, expected):
 
 
 def test_reasons_are_those_of_the_verdict():
-    found = [Finding("warned", "a"), Finding("left out", "b"), Finding("left out", "c")]
-    assert reasons_of(found) == "b; c"
-    assert reasons_of(found[:1]) == "a"
+    violations = [Finding("warned", "a"), Finding("left out", "b"), Finding("left out", "c")]
+    assert reasons_of(violations) == "b; c"
+    assert reasons_of(violations[:1]) == "a"
     assert reasons_of([]) == ""
 
 
@@ -293,8 +295,8 @@ def test_limit_of_an_unknown_measure_is_refused():
 def test_each_parts_pose_carries_its_points_through_the_world(make_clip):
     track = make_clip(6, articulated=True).object
     facts = ObjectFacts.of(track.model)
-    found, moved = object_motion(track, facts), facts.part == 1
+    motion, moved = object_motion(track, facts), facts.part == 1
     assert 0 < moved.sum() < len(moved)
     for part, rows in enumerate((~moved, moved)):
-        placed = facts.points_m[rows] @ found.rotmats[part].transpose(0, 2, 1) + found.positions_m[part][:, None]
-        np.testing.assert_allclose(placed, found.points_m[:, rows], atol=1e-9)
+        placed = facts.points_m[rows] @ motion.rotmats[part].transpose(0, 2, 1) + motion.positions_m[part][:, None]
+        np.testing.assert_allclose(placed, motion.points_m[:, rows], atol=1e-9)

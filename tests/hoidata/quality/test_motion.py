@@ -29,9 +29,9 @@ def test_free_fall_is_measured_as_9_81_m_s2():
     seconds = np.arange(20) / 30
     falling = np.zeros((20, 2, 3))
     falling[:, :, 2] = (-0.5 * 9.81 * seconds**2)[:, None]
-    found = accelerations_m_s2(falling, usable(20))
-    assert np.isnan(found[[0, -1]]).all()
-    assert found[1:-1] == pytest.approx(9.81, rel=1e-9)
+    accelerations = accelerations_m_s2(falling, usable(20))
+    assert np.isnan(accelerations[[0, -1]]).all()
+    assert accelerations[1:-1] == pytest.approx(9.81, rel=1e-9)
 
 
 def test_noise_of_one_millimetre_shakes_at_3_5_m_s2():
@@ -49,10 +49,10 @@ def test_frames_that_mean_nothing_spoil_neither_accelerations_nor_steps():
     points, valid = smooth(), usable(60)
     clean_accelerations, clean_steps = accelerations_m_s2(points, valid), steps_m(points, valid)
     points[20], valid[20] = 7.0, False
-    found, steps = accelerations_m_s2(points, valid), steps_m(points, valid)
-    assert np.isnan(found[19:22]).all()
-    kept = [1, 18, 22, 58]
-    assert found[kept].tolist() == clean_accelerations[kept].tolist()
+    accelerations, steps = accelerations_m_s2(points, valid), steps_m(points, valid)
+    assert np.isnan(accelerations[19:22]).all()
+    usable_frames = [1, 18, 22, 58]
+    assert accelerations[usable_frames].tolist() == clean_accelerations[usable_frames].tolist()
     assert steps[[19, 20]].tolist() == [0, 0]
     assert steps[[18, 21]].tolist() == clean_steps[[18, 21]].tolist()
 
@@ -100,8 +100,8 @@ def test_frames_that_mean_nothing_are_not_frozen():
 
 
 @pytest.mark.parametrize(
-    ("valid", "share"),
+    ("valid", "fraction"),
     [("1111", 0.0), ("0000", 0.0), ("0110", 0.0), ("1011", 0.25), ("0100010", 0.6)],
 )
-def test_gap_is_what_is_missing_between_the_first_and_the_last_sight_of_a_hand(valid, share):
-    assert gap_share(np.array([flag == "1" for flag in valid])) == pytest.approx(share)
+def test_gap_is_what_is_missing_between_the_first_and_the_last_sight_of_a_hand(valid, fraction):
+    assert gap_share(np.array([flag == "1" for flag in valid])) == pytest.approx(fraction)

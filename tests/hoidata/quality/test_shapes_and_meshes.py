@@ -86,7 +86,7 @@ def test_inside_out_and_empty_surfaces_are_told_apart_from_filled_ones():
     assert inside_out.unfilled_share == pytest.approx(2)
     assert is_solid(turned)
     assert both.unfilled_share == pytest.approx(1)
-    assert is_solid(doubled)  # one surface, drawn once for each side
+    assert is_solid(doubled)  # one surface, with triangles for both sides
     assert flat.unfilled_share == 1
     assert isinstance(solid_of(*triangle), NoSolid)
 

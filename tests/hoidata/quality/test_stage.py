@@ -93,7 +93,9 @@ def test_penetration_is_measured_in_an_object_divided_by_part_labels(make_clip, 
     mesh = trimesh.Trimesh(clip.object.model.vertices_m, clip.object.model.faces).subdivide().subdivide()
     part = (mesh.vertices[:, 2] > mesh.centroid[2] + 1e-6).astype(np.uint8)
     hinge = Hinge(np.array([1.0, 0.0, 0.0]), np.zeros(3))
-    model = ObjectModel("divided", np.array(mesh.vertices), np.array(mesh.faces), part, hinge)
+    model = ObjectModel(
+        name="divided", vertices_m=np.array(mesh.vertices), faces=np.array(mesh.faces), part=part, hinge=hinge
+    )
     track = replace(clip.object, model=model, hinge_rad=np.zeros(FRAMES, np.float32))
     write_clips(tmp_path / "clips", [replace(clip, object=track)])
     quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
@@ -218,9 +220,9 @@ def test_lag_planted_into_a_generated_corpus_is_found_within_a_frame(corpus, tmp
     clips = [late_hands(store.clip(clip_id), late) for clip_id in store.ids]
     write_clips(tmp_path / "clips", clips)
     quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
-    found = tables(tmp_path / "quality")[0]["time_offset_frames"].dropna()
-    assert len(found) >= 0.6 * len(clips)
-    assert (np.abs(found - late) <= 1).all()
+    offsets = tables(tmp_path / "quality")[0]["time_offset_frames"].dropna()
+    assert len(offsets) >= 0.6 * len(clips)
+    assert (np.abs(offsets - late) <= 1).all()
 
 
 @pytest.mark.long

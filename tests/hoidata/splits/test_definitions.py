@@ -73,12 +73,12 @@ def test_text2hois_test_subjects_and_our_validation_subjects():
 
 def test_h2os_official_split_counts_sequences_segments_and_frames_as_its_lists_do():
     listed = published("h2o")
-    found = parts("h2o", "official", listed.sequences)
-    assert Counter(found.values()) == {"train": 114, "validation": 24, "test": 46}
+    assigned = parts("h2o", "official", listed.sequences)
+    assert Counter(assigned.values()) == {"train": 114, "validation": 24, "test": 46}
     segments, frames = Counter(), Counter()
     for sequence, n_segments, n_frames in zip(listed.sequences, listed.segments, listed.frames, strict=True):
-        segments[found[sequence]] += n_segments
-        frames[found[sequence]] += n_frames
+        segments[assigned[sequence]] += n_segments
+        frames[assigned[sequence]] += n_frames
     assert segments == {"train": 569, "validation": 122, "test": 242}
     assert frames == {"train": 68929, "validation": 14676, "test": 30724}
 
@@ -99,7 +99,7 @@ def test_an_empty_list_of_sequences_is_refused(tmp_path, monkeypatch):
     (tmp_path / "attic/adapter.py").write_text("")
     (tmp_path / "attic/published.json").write_text('{"source": "nobody knows", "sequences": []}')
     monkeypatch.setenv("HOIDATA_DATASETS", str(tmp_path / "attic"))
-    with pytest.raises(BadInput, match="leave it out, and say in its source why there is none"):
+    with pytest.raises(BadInput, match="remove the key, and give the reason in `source`"):
         published("attic")
 
 
@@ -112,17 +112,17 @@ def test_grabs_official_split_is_by_object():
 
 @pytest.mark.parametrize("protocol", ["p1", "p2"])
 def test_arctics_protocols_hold_out_s05_and_the_withheld_s03(protocol):
-    found = parts("arctic", protocol, published("arctic").sequences)
-    assert Counter(found.values()) == {"train": 267, "validation": 34, "test": 38}
-    assert {name.split("/")[0] for name, part in found.items() if part == "validation"} == {"s05"}
-    assert {name.split("/")[0] for name, part in found.items() if part == "test"} == {"s03"}
+    assigned = parts("arctic", protocol, published("arctic").sequences)
+    assert Counter(assigned.values()) == {"train": 267, "validation": 34, "test": 38}
+    assert {name.split("/")[0] for name, part in assigned.items() if part == "validation"} == {"s05"}
+    assert {name.split("/")[0] for name, part in assigned.items() if part == "test"} == {"s03"}
 
 
 def test_bimart_tests_on_one_grab_and_three_use_sequences_of_each_of_eleven_objects():
-    """BimArt, section 4: 257 training and 44 test sequences, four per object, one of them grasping and relocation."""
-    found = parts("arctic", "bimart", published("arctic").usable)
-    assert Counter(found.values()) == {"train": 257, "test": 44}
-    kinds = Counter(tuple(name.split("/")[1].split("_")[:2]) for name, part in found.items() if part == "test")
+    """BimArt, section 4: 257 training and 44 test sequences, four per object, one with grasping and relocation."""
+    assigned = parts("arctic", "bimart", published("arctic").usable)
+    assert Counter(assigned.values()) == {"train": 257, "test": 44}
+    kinds = Counter(tuple(name.split("/")[1].split("_")[:2]) for name, part in assigned.items() if part == "test")
     objects = {name.split("/")[1].split("_")[0] for name in published("arctic").sequences}
     assert kinds == {(name, kind): count for name in objects for kind, count in (("grab", 1), ("use", 3))}
     assert len(objects) == 11
@@ -134,22 +134,22 @@ def test_bimarts_committed_list_follows_its_rule():
 
     in_order = sorted(published("arctic").usable, key=order)
     chosen = set()
-    for thing in {name.split("/")[1].split("_")[0] for name in in_order}:
-        chosen |= set([name for name in in_order if f"/{thing}_grab_" in name][:1])
-        chosen |= set([name for name in in_order if f"/{thing}_use_" in name][:3])
+    for object_name in {name.split("/")[1].split("_")[0] for name in in_order}:
+        chosen |= set([name for name in in_order if f"/{object_name}_grab_" in name][:1])
+        chosen |= set([name for name in in_order if f"/{object_name}_use_" in name][:3])
     assert set(definitions_for("arctic")["bimart"].rule.test) == chosen
 
 
 def test_bimart_as_released_tests_on_the_first_and_the_last_three_names_of_every_object():
     names = sorted(published("arctic").usable)
-    found = parts("arctic", "bimart-released", names)
-    assert Counter(found.values()) == {"train": 257, "test": 44}
-    held = {name for name, part in found.items() if part == "test"}
+    assigned = parts("arctic", "bimart-released", names)
+    assert Counter(assigned.values()) == {"train": 257, "test": 44}
+    test_names = {name for name, part in assigned.items() if part == "test"}
     objects = {name.split("/")[1].split("_")[0] for name in names}
-    own = [[name for name in names if f"/{thing}_" in name] for thing in objects]
-    assert held == {name for row in own for name in (row[0], *row[-3:])}
-    assert Counter(name[:3] for name in held) == {"s10": 21, "s01": 11, "s09": 11, "s08": 1}
-    assert len(held & set(definitions_for("arctic")["bimart"].rule.test)) == 5
+    by_object = [[name for name in names if f"/{item}_" in name] for item in objects]
+    assert test_names == {name for members in by_object for name in (members[0], *members[-3:])}
+    assert Counter(name[:3] for name in test_names) == {"s10": 21, "s01": 11, "s09": 11, "s08": 1}
+    assert len(test_names & set(definitions_for("arctic")["bimart"].rule.test)) == 5
 
 
 def test_bimart_with_a_validation_part_tests_on_the_same_and_validates_on_two_of_each_object():
@@ -175,16 +175,16 @@ def test_every_verb_of_a_held_out_object_is_also_done_with_a_training_object():
     for verb, noun in ACTIONS[1:]:
         pairs["h2o"].setdefault(verb, set()).add(noun)
     for dataset, objects_of in pairs.items():
-        held = {name for part in held_out(dataset, "unseen-object") for name in part}
-        assert all(objects - held for objects in objects_of.values()), dataset
-        assert held <= set.union(*objects_of.values()), dataset
+        unseen = {name for part in held_out(dataset, "unseen-object") for name in part}
+        assert all(objects - unseen for objects in objects_of.values()), dataset
+        assert unseen <= set.union(*objects_of.values()), dataset
 
 
 @pytest.mark.parametrize("dataset", built_in_names())
 def test_every_definition_says_its_source_its_version_and_its_promises(dataset):
-    found = definitions_for(dataset)
-    assert found
-    for definition in found.values():
+    assigned = definitions_for(dataset)
+    assert assigned
+    for definition in assigned.values():
         assert definition.version >= 1
         assert len(definition.source) > 40
         if definition.rule.by in ("subject", "object"):
@@ -197,10 +197,10 @@ def test_every_definition_says_its_source_its_version_and_its_promises(dataset):
 
 def test_a_split_that_several_datasets_have_is_from_the_same_source():
     for name in ("text2hoi", "unseen-object", "unseen-subject"):
-        found = {
+        assigned = {
             (rules[name].version, rules[name].source) for d in built_in_names() if name in (rules := definitions_for(d))
         }
-        assert len(found) == 1
+        assert len(assigned) == 1
 
 
 def test_a_dataset_says_its_own_split_and_params_override_it():
@@ -233,16 +233,16 @@ def test_an_unknown_name_lists_the_splits_of_that_dataset():
         match=r"one of: bimart, bimart-released, bimart-validated, composition, .*drawn-per-object, p1, .*subject, got",
     ):
         choose("arctic", "rounds")
-    for wanted, got in (("text2hoi", "'text2hoi'"), (None, "nothing")):
+    for choice, got in (("text2hoi", "'text2hoi'"), (None, "nothing")):
         with pytest.raises(BadInput, match=f"one of: composition, drawn-object, drawn-per-object, got {got}"):
-            choose("mydata", wanted)
+            choose("mydata", choice)
 
 
 def test_a_rule_of_the_users_own_needs_no_name():
     values = {"by": "subject", "train": "rest", "test": ["p7"]}
-    own = choose("grab", values)
-    assert own.rule.as_json() == {**values, "validation": []}
-    assert own.promises == ("subject", "sequence", "file")
+    custom = choose("grab", values)
+    assert custom.rule.as_json() == {**values, "validation": []}
+    assert custom.promises == ("subject", "sequence", "file")
     assert choose("h2o", {"by": "rounds", "promises": ["subject"]}).promises == ("subject",)
 
 

@@ -17,7 +17,7 @@ from hoidata.store.store import open_store, write_store
 FILES = ["raw/a.npz", "raw/b.npz", "mesh/box.ply", "raw/sub/c.npz"]
 
 
-def row(clip_id: str, **facts) -> dict:
+def clip_row(clip_id: str, **facts) -> dict:
     usual = {"subject": f"of {clip_id}", "object": f"box of {clip_id}", "other_objects": [], "source_files": []}
     usual |= {"verb": "lift", "hand_type": "left"}
     return usual | {"sequence": clip_id, "first_source_frame": 0, "last_source_frame": 9, "clip_id": clip_id} | facts
@@ -49,45 +49,47 @@ CASES = {
 @pytest.mark.parametrize("kind", CASES)
 def test_what_two_parts_share_is_found_and_breaks_the_promise(kind):
     first, second, name = CASES[kind]
-    rows = [row("a", **first), row("b", **second)]
-    found = leaks(rows, {"a": "train", "b": "test"}, [kind])
-    assert found.shared[kind] == (name,)
-    assert kind in found.broken
+    rows = [clip_row("a", **first), clip_row("b", **second)]
+    result = leaks(rows, {"a": "train", "b": "test"}, [kind])
+    assert result.shared[kind] == (name,)
+    assert kind in result.broken
     assert not leaks(rows, {"a": "test", "b": "test"}, [kind]).shared[kind]
     assert not leaks(rows, {"a": None, "b": "test"}, [kind]).shared[kind]
 
 
 def test_clips_that_share_nothing_break_no_promise():
-    found = leaks([row("a", source_files=[0]), row("b", source_files=[1])], {"a": "train", "b": "validation"}, PROMISES)
-    assert found.broken == ()
-    assert found.promised == PROMISES
-    assert found.as_json() == {kind: {"promised": True, "in_two_parts": 0, "first": []} for kind in PROMISES}
+    result = leaks(
+        [clip_row("a", source_files=[0]), clip_row("b", source_files=[1])], {"a": "train", "b": "validation"}, PROMISES
+    )
+    assert result.broken == ()
+    assert result.promised == PROMISES
+    assert result.as_json() == {kind: {"promised": True, "in_two_parts": 0, "first": []} for kind in PROMISES}
 
 
 def test_a_table_may_stand_in_both_parts():
-    rows = [row("a", other_objects=["table"]), row("b", other_objects=["table", "cup"])]
+    rows = [clip_row("a", other_objects=["table"]), clip_row("b", other_objects=["table", "cup"])]
     assert leaks(rows, {"a": "train", "b": "test"}, ["object"]).shared["object"] == ()
 
 
 def test_a_mesh_may_serve_both_parts_but_a_motion_file_in_a_subfolder_may_not():
-    rows = [row("a", source_files=[2, 3]), row("b", source_files=[2, 3])]
+    rows = [clip_row("a", source_files=[2, 3]), clip_row("b", source_files=[2, 3])]
     assert leaks(rows, {"a": "train", "b": "test"}, ["file"]).shared["file"] == ("raw/sub/c.npz",)
 
 
 def test_a_copy_under_another_name_is_a_leak_whatever_was_promised():
-    rows = [row("a"), row("b"), row("c")]
-    found = leaks(rows, {"a": "train", "b": "test", "c": "test"}, digests={"a": "1", "b": "1", "c": "2"})
-    assert found.shared["motion"] == ("a = b",)
-    assert found.broken == ("motion",)
+    rows = [clip_row("a"), clip_row("b"), clip_row("c")]
+    result = leaks(rows, {"a": "train", "b": "test", "c": "test"}, digests={"a": "1", "b": "1", "c": "2"})
+    assert result.shared["motion"] == ("a = b",)
+    assert result.broken == ("motion",)
 
 
 def test_copies_within_one_part_are_no_leak():
-    found = leaks([row("a"), row("b")], {"a": "train", "b": "train"}, digests={"a": "1", "b": "1"})
-    assert found.shared["motion"] == ()
+    result = leaks([clip_row("a"), clip_row("b")], {"a": "train", "b": "train"}, digests={"a": "1", "b": "1"})
+    assert result.shared["motion"] == ()
 
 
 def test_sequences_of_two_subjects_share_no_frames_though_they_have_one_name():
-    rows = [row("a", subject="s1", sequence="cup_1"), row("b", subject="s2", sequence="cup_1")]
+    rows = [clip_row("a", subject="s1", sequence="cup_1"), clip_row("b", subject="s2", sequence="cup_1")]
     assert leaks(rows, {"a": "train", "b": "test"}).shared["frame"] == ()
 
 
@@ -95,18 +97,18 @@ def test_overlaps_are_seen_across_a_clip_in_between():
     """a lasts over b and reaches c: neighbours alone would miss it."""
     spans = {"a": (0, 100), "b": (10, 20), "c": (90, 120)}
     rows = [
-        row(name, subject="s", sequence="x", first_source_frame=first, last_source_frame=last)
+        clip_row(name, subject="s", sequence="x", first_source_frame=first, last_source_frame=last)
         for name, (first, last) in spans.items()
     ]
-    found = leaks(rows, {"a": "train", "b": "train", "c": "test"})
-    assert found.broken == ("frame",)
-    assert found.shared["frame"] == ("a (train) and c (test) overlap",)
+    result = leaks(rows, {"a": "train", "b": "train", "c": "test"})
+    assert result.broken == ("frame",)
+    assert result.shared["frame"] == ("a (train) and c (test) overlap",)
 
 
 def test_what_is_not_promised_is_still_recorded():
-    found = leaks([row("a", subject="s1"), row("b", subject="s1")], {"a": "train", "b": "test"}, ["object"])
-    assert found.broken == ()
-    assert found.as_json()["subject"] == {"promised": False, "in_two_parts": 1, "first": ["s1"]}
+    result = leaks([clip_row("a", subject="s1"), clip_row("b", subject="s1")], {"a": "train", "b": "test"}, ["object"])
+    assert result.broken == ()
+    assert result.as_json()["subject"] == {"promised": False, "in_two_parts": 1, "first": ["s1"]}
 
 
 def hand_types(clip_ids, nearest=0.01) -> pd.DataFrame:
@@ -129,26 +131,26 @@ def store(make_clip, tmp_path):
     return open_store(tmp_path / "clips")
 
 
-def test_figures_of_one_column_are_those_of_the_definition():
+def test_statistics_of_one_column_are_those_of_the_definition():
     values = [3.0, -1.0, 4.0, 1.5, 9.25]
-    found = summary(np.array(values)[:, None])
+    statistics = summary(np.array(values)[:, None])
     mean = sum(values) / 5
-    assert found["count"] == 5
-    assert found["mean"] == [pytest.approx(mean, rel=1e-8)]
-    assert found["std"] == [pytest.approx(math.sqrt(sum((v - mean) ** 2 for v in values) / 5), rel=1e-8)]
-    assert (found["min"], found["max"]) == ([-1.0], [9.25])
+    assert statistics["count"] == 5
+    assert statistics["mean"] == [pytest.approx(mean, rel=1e-8)]
+    assert statistics["std"] == [pytest.approx(math.sqrt(sum((v - mean) ** 2 for v in values) / 5), rel=1e-8)]
+    assert (statistics["min"], statistics["max"]) == ([-1.0], [9.25])
     ordered = sorted(values)
-    for share, got in zip(QUANTILES, found["quantile_values"][0], strict=True):
-        place = share * 4
-        below = int(place)
+    for fraction, got in zip(QUANTILES, statistics["quantile_values"][0], strict=True):
+        position = fraction * 4
+        below = int(position)
         above = min(below + 1, 4)
-        assert got == pytest.approx(ordered[below] + (place - below) * (ordered[above] - ordered[below]), rel=1e-8)
+        assert got == pytest.approx(ordered[below] + (position - below) * (ordered[above] - ordered[below]), rel=1e-8)
 
 
 def test_quantities_of_hands_count_valid_frames_only(store):
-    found = training_statistics(store, store.ids, hand_types(store.ids))
-    assert (found["clips"], found["frames"]) == (2, 32)
-    counts = {name: facts["count"] for name, facts in found["quantities"].items()}
+    statistics = training_statistics(store, store.ids, hand_types(store.ids))
+    assert (statistics["clips"], statistics["frames"]) == (2, 32)
+    counts = {name: facts["count"] for name, facts in statistics["quantities"].items()}
     assert counts["left_wrist_m"] == counts["left_orient_6d"] == counts["left_wrist_to_object_m"] == 8 + 20
     assert counts["right_hand_pose"] == 12
     assert counts["left_betas"] == 8 + 1
@@ -156,39 +158,39 @@ def test_quantities_of_hands_count_valid_frames_only(store):
     assert counts["object_translation_m"] == 32
     assert counts["object_hinge_rad"] == 20
     assert counts["n_frames"] == 2
-    assert found["quantities"]["n_frames"]["mean"] == [16.0]
+    assert statistics["quantities"]["n_frames"]["mean"] == [16.0]
     assert (counts["left_closest_m"], counts["right_closest_m"]) == (2, 0)
-    assert max(found["quantities"]["left_wrist_m"]["max"]) < 10
+    assert max(statistics["quantities"]["left_wrist_m"]["max"]) < 10
 
 
 @pytest.mark.parametrize("side", SIDES)
 def test_positions_and_rotations_agree_with_another_computation(store, side):
-    found = training_statistics(store, store.ids, hand_types(store.ids))["quantities"]
+    quantities = training_statistics(store, store.ids, hand_types(store.ids))["quantities"]
     clips = [store.clip(clip_id) for clip_id in store.ids]
-    shift, rows, turned = [], [], []
+    shift, rotations_6d, object_rotations_6d = [], [], []
     for clip in clips:
         hand, moved = clip.hands[side], clip.object
         for frame in np.flatnonzero(hand.valid):
             shift.append(hand.wrist_m[frame].astype(float) - moved.translation_m[frame].astype(float))
-            rows.append(Rotation.from_rotvec(hand.global_orient[frame]).as_matrix()[:, :2].ravel())
-        turned += [Rotation.from_rotvec(turn).as_matrix()[:, :2].ravel() for turn in moved.rotvec]
-    np.testing.assert_allclose(found[f"{side}_wrist_from_object_m"]["mean"], np.mean(shift, axis=0), atol=1e-6)
-    distances = [math.dist(row, (0, 0, 0)) for row in shift]
-    np.testing.assert_allclose(found[f"{side}_wrist_to_object_m"]["max"], [max(distances)], atol=1e-6)
-    np.testing.assert_allclose(found[f"{side}_orient_6d"]["std"], np.std(rows, axis=0), atol=1e-6)
-    np.testing.assert_allclose(found["object_orient_6d"]["mean"], np.mean(turned, axis=0), atol=1e-6)
+            rotations_6d.append(Rotation.from_rotvec(hand.global_orient[frame]).as_matrix()[:, :2].ravel())
+        object_rotations_6d += [Rotation.from_rotvec(rotvec).as_matrix()[:, :2].ravel() for rotvec in moved.rotvec]
+    np.testing.assert_allclose(quantities[f"{side}_wrist_from_object_m"]["mean"], np.mean(shift, axis=0), atol=1e-6)
+    distances = [math.dist(offset, (0, 0, 0)) for offset in shift]
+    np.testing.assert_allclose(quantities[f"{side}_wrist_to_object_m"]["max"], [max(distances)], atol=1e-6)
+    np.testing.assert_allclose(quantities[f"{side}_orient_6d"]["std"], np.std(rotations_6d, axis=0), atol=1e-6)
+    np.testing.assert_allclose(quantities["object_orient_6d"]["mean"], np.mean(object_rotations_6d, axis=0), atol=1e-6)
 
 
 def test_every_stored_number_of_a_hand_has_its_columns(store):
-    found = training_statistics(store, store.ids, hand_types(store.ids))["quantities"]
+    quantities = training_statistics(store, store.ids, hand_types(store.ids))["quantities"]
     widths = {"wrist_m": 3, "wrist_from_object_m": 3, "orient_6d": 6, "hand_pose": 45, "betas": 10, "closest_m": 1}
     for name, width in widths.items():
-        facts = found[f"left_{name}"]
+        facts = quantities[f"left_{name}"]
         assert {len(facts[key]) for key in ("mean", "std", "min", "max", "quantile_values")} == {width}
         assert all(len(values) == len(QUANTILES) == 7 for values in facts["quantile_values"])
         assert facts["unit"]
 
 
 def test_no_training_clip_gives_counts_of_zero(store):
-    found = training_statistics(store, [], hand_types(store.ids))
-    assert {facts["count"] for facts in found["quantities"].values()} == {0}
+    statistics = training_statistics(store, [], hand_types(store.ids))
+    assert {facts["count"] for facts in statistics["quantities"].values()} == {0}

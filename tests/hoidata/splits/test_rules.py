@@ -1,4 +1,4 @@
-"""Rules put clips into parts, by names or in time; what no part names is left out, never trained on."""
+"""Rules assign clips to parts, by names or in time. Clips that no part lists are excluded."""
 
 import hashlib
 from collections import Counter
@@ -23,7 +23,7 @@ COLUMNS = ["clip_id", "subject", "sequence", "first_source_frame", "last_source_
 
 def table(rows) -> pd.DataFrame:
     """Rows of the first five columns, or of all."""
-    full = [(*row, "box", [])[: len(COLUMNS)] if len(row) == 5 else row for row in rows]
+    full = [(*values, "box", [])[: len(COLUMNS)] if len(values) == 5 else values for values in rows]
     return pd.DataFrame(full, columns=COLUMNS).set_index("clip_id", drop=False).rename_axis(None)
 
 
@@ -158,27 +158,35 @@ def test_drawn_sequences_keep_together_and_few_change_parts_when_others_come():
         assert all(parts[f"{name}/0"] == parts[f"{name}/1"] for name in sequences)
         return {name: parts[f"{name}/0"] for name in sequences}
 
-    found = drawn(names)
-    assert Counter(found.values()) == {"train": 28, "validation": 6, "test": 6}
-    assert found == drawn(names[::-1])
+    assigned = drawn(names)
+    assert Counter(assigned.values()) == {"train": 28, "validation": 6, "test": 6}
+    assert assigned == drawn(names[::-1])
     more = drawn([*names, "day4/new"])
-    assert sum(more[name] != found[name] for name in names) <= 2
+    assert sum(more[name] != assigned[name] for name in names) <= 2
     assert set(drawn(names[:3]).values()) == {"train", "validation", "test"}
 
 
-def test_of_every_object_a_share_of_its_sequences_tests_and_at_least_one():
+def test_each_object_has_its_share_of_test_sequences_and_at_least_one():
     counts = {"box": 20, "mug": 7, "pen": 2, "cup": 1}
-    names = {f"s{number % 3}/{thing}_{number:02d}": thing for thing, count in counts.items() for number in range(count)}
-    rows = [(f"{name}/{cut}", "s1", name, cut, cut, thing, []) for name, thing in names.items() for cut in (0, 9)]
+    names = {
+        f"s{number % 3}/{object_name}_{number:02d}": object_name
+        for object_name, count in counts.items()
+        for number in range(count)
+    }
+    rows = [
+        (f"{name}/{cut}", "s1", name, cut, cut, object_name, [])
+        for name, object_name in names.items()
+        for cut in (0, 9)
+    ]
     split = assign_split(table(rows), SplitRule("drawn-per-object", validation_share=0.1, test_share=44 / 301))
     assert all(split[f"{name}/0"] == split[f"{name}/9"] for name in names)
-    found = Counter((thing, split[f"{name}/0"]) for name, thing in names.items())
-    assert found == {
+    part_counts = Counter((object_name, split[f"{name}/0"]) for name, object_name in names.items())
+    assert part_counts == {
         **{("box", "train"): 15, ("box", "validation"): 2, ("box", "test"): 3},
         **{("mug", "train"): 5, ("mug", "validation"): 1, ("mug", "test"): 1},
         **{("pen", "train"): 1, ("pen", "test"): 1, ("cup", "test"): 1},
     }
-    in_order = sorted((name for name, thing in names.items() if thing == "box"), key=digest)
+    in_order = sorted((name for name, object_name in names.items() if object_name == "box"), key=digest)
     assert [split[f"{name}/0"] for name in in_order] == ["train"] * 15 + ["validation"] * 2 + ["test"] * 3
 
 
@@ -200,10 +208,10 @@ def clips_of(compositions, overlapping: bool = False) -> pd.DataFrame:
     rows = []
     for number, (verb, name, hand) in enumerate(compositions):
         first = 200 * (number // 2) + 50 * (number % 2) if overlapping else 0
-        place = {"sequence": "s1/all" if overlapping else f"s1/{number}", "subject": "s1"}
+        source = {"sequence": "s1/all" if overlapping else f"s1/{number}", "subject": "s1"}
         words = {"verb": verb, "object": name, "hand_type": hand, "other_objects": []}
         span = {"first_source_frame": first, "last_source_frame": first + 99}
-        rows.append({"clip_id": f"clip{number:03d}", **place, **words, **span})
+        rows.append({"clip_id": f"clip{number:03d}", **source, **words, **span})
     return pd.DataFrame(rows).set_index("clip_id", drop=False).rename_axis(None)
 
 
@@ -230,9 +238,9 @@ def test_what_is_held_out_is_seen_in_training_but_never_together_and_as_much_as_
 
 def test_no_verb_object_or_hand_is_held_out_much_more_than_others():
     rows = clips_of(CROSSED)
-    held = assign_split(rows, BY) != "train"
+    held_out = assign_split(rows, BY) != "train"
     for column in ("verb", "object", "hand_type"):
-        shares = held.groupby(rows[column]).mean()
+        shares = held_out.groupby(rows[column]).mean()
         assert 0.15 <= shares.min() <= shares.max() <= 0.45, column
 
 
@@ -252,10 +260,10 @@ def test_a_verb_of_one_object_alone_and_an_object_of_one_verb_stay_in_training()
 
 @pytest.mark.parametrize("by", ["composition", "drawn-object"])
 def test_a_corpus_without_crossings_is_refused(by):
-    """A verb per object, as many a recorded set has: nothing can be held out that training has in another way."""
+    """A verb per object, as many a recorded set has: nothing can be held_out out that training has in another way."""
     rows = clips_of([(f"verb {name}", name, "right") for name in OBJECTS] * 6)
     with pytest.raises(
-        BadInput, match=rf"split by {by}: expected 3 clips or more .* for test, got 0 of 30.*cross more"
+        BadInput, match=rf"split by {by}: expected 3 clips or more .* for test, got 0 of 30.*combined more often"
     ):
         assign_split(rows, SplitRule(by))
 
@@ -263,13 +271,13 @@ def test_a_corpus_without_crossings_is_refused(by):
 def test_fewer_clips_than_the_least_are_refused():
     rows = clips_of(CROSSED)
     assert (assign_split(rows, replace(BY, least_clips=24)) == "test").sum() == 24
-    with pytest.raises(BadInput, match=r"25 clips or more that can be held out for test, got 24 of 120"):
+    with pytest.raises(BadInput, match=r"25 clips or more that can be held_out out for test, got 24 of 120"):
         assign_split(rows, replace(BY, least_clips=25))
     with pytest.raises(BadInput, match="1 clips or more"):
         replace(BY, least_clips=0)
 
 
-def test_a_clip_that_shares_frames_with_a_held_out_one_is_left_out():
+def test_a_clip_that_shares_frames_with_a_held_out_one_is_excluded():
     rows = clips_of(CROSSED, overlapping=True)
     free, parts = assign_split(clips_of(CROSSED), BY).tolist(), assign_split(rows, BY).tolist()
     rank = {"test": 0, "validation": 1, "train": 2}
@@ -285,9 +293,13 @@ def test_drawn_objects_are_in_one_part_and_their_verbs_and_hands_in_training_too
     rows.at["clip000", "other_objects"] = ["jug", "table"]
     parts = assign_split(rows, SplitRule("drawn-object", validation_share=0.15, test_share=0.2))
     of = {name: set(parts[rows["object"] == name].dropna()) for name in (*OBJECTS, "stapler")}
-    assert all(len(found) == 1 for found in of.values())
+    assert all(len(object_parts) == 1 for object_parts in of.values())
     assert of["stapler"] == {"train"}
-    assert Counter(part for found in of.values() for part in found) == {"train": 4, "validation": 1, "test": 1}
+    assert Counter(part for object_parts in of.values() for part in object_parts) == {
+        "train": 4,
+        "validation": 1,
+        "test": 1,
+    }
     assert (parts["clip000"] is None) == (of["cup"] != of["jug"])
 
 
@@ -300,9 +312,9 @@ def test_the_stage_splits_by_composition_and_the_leak_check_looks_at_composition
         track = replace(clip.object, model=replace(box_model(), name=name))
         clips.append(replace(clip, object=track, sequence=f"s1/{number}"))
     store = load_annotated(write_annotated(tmp_path / "toy", clips, rule=rule, points=64))
-    found = pd.DataFrame({"part": store.splits, "words": dict(zip(store.ids(), words * 2, strict=True))})
-    assert {len(set(parts)) for _, parts in found.groupby("words")["part"]} == {1}
-    assert Counter(found["part"]) == {"train": 16, "validation": 4, "test": 4}
+    assigned = pd.DataFrame({"part": store.splits, "words": dict(zip(store.ids(), words * 2, strict=True))})
+    assert {len(set(parts)) for _, parts in assigned.groupby("words")["part"]} == {1}
+    assert Counter(assigned["part"]) == {"train": 16, "validation": 4, "test": 4}
     record = store.split_info["chosen"]
     assert record["rule"] == {**rule, "least_clips": 1}
     assert record["leaks"]["composition"] == {"promised": True, "in_two_parts": 0, "first": []}

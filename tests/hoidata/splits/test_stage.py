@@ -1,4 +1,4 @@
-"""The stage split: what it writes, what it refuses, and that training figures know nothing of held-out clips."""
+"""The stage split: its output, its errors, and training statistics without held-out clips."""
 
 import json
 from dataclasses import replace
@@ -30,7 +30,7 @@ def clips(make_clip):
     ]
 
 
-def write(root: Path, clips, without_words=(), wanted=RULE) -> Path:
+def write(root: Path, clips, without_words=(), choice=RULE) -> Path:
     """A store, the two tables of the annotation that the stage reads, and its output."""
     write_store(root / "clips", clips, generated_info("grab"))
     ids = [clip.clip_id for clip in clips]
@@ -40,7 +40,7 @@ def write(root: Path, clips, without_words=(), wanted=RULE) -> Path:
     pd.DataFrame({"clip_id": ids, **nearest, **words}).to_parquet(root / "annotation" / "hand_type.parquet")
     words = [clip_id for clip_id in ids for _ in range(4) if clip_id not in without_words]
     pd.DataFrame({"clip_id": words}, dtype=str).to_parquet(root / "annotation" / "text.parquet")
-    split_store(root / "clips", root / "annotation", root / "splits", wanted)
+    split_store(root / "clips", root / "annotation", root / "splits", choice)
     return root / "splits"
 
 
@@ -73,11 +73,11 @@ def test_contact_labels_of_the_source_are_not_read(clips, tmp_path):
 
 
 def test_all_named_splits_of_the_dataset_stand_beside_the_chosen_one(clips, tmp_path):
-    folder = write(tmp_path, clips, wanted="text2hoi")
+    folder = write(tmp_path, clips, choice="text2hoi")
     columns = list(pd.read_parquet(folder / "splits.parquet").columns)
     assert columns == ["clip_id", "official", "text2hoi", "unseen-object", "unseen-subject", "split"]
     assert parts(folder) == parts(folder, "text2hoi")
-    rare = write(tmp_path / "rare", clips, wanted="drawn-per-object")  # written only where it is chosen
+    rare = write(tmp_path / "rare", clips, choice="drawn-per-object")  # written only where it is chosen
     assert list(pd.read_parquet(rare / "splits.parquet").columns) == columns
     assert set(parts(rare).values()) == {"train", "validation", "test"}
     assert list(parts(folder, "unseen-subject").values()) == ["train", "train", "validation", "test", "train"]
@@ -94,8 +94,8 @@ def test_all_named_splits_of_the_dataset_stand_beside_the_chosen_one(clips, tmp_
 def test_clips_without_sentences_belong_to_no_part_and_shift_no_round(clips, tmp_path):
     """Five clips of one recording; without the second, the fourth of those left validates and nobody tests."""
     clips = [
-        replace(clip, sequence="cyl", source_frames=np.arange(16, dtype=np.int32) + 100 * place)
-        for place, clip in enumerate(clips)
+        replace(clip, sequence="cyl", source_frames=np.arange(16, dtype=np.int32) + 100 * index)
+        for index, clip in enumerate(clips)
     ]
     folder = write(tmp_path, clips, [clips[1].clip_id], {"by": "rounds"})
     assert list(parts(folder).values()) == ["train", None, "train", "train", "validation"]
@@ -118,19 +118,19 @@ def test_numbers_of_held_out_clips_change_no_statistic(clips, tmp_path):
 
 
 def test_statistics_are_those_of_the_training_clips(clips, tmp_path):
-    found = json.loads((write(tmp_path, clips) / "statistics.json").read_text())
-    assert (found["clips"], found["frames"]) == (2, 32)
+    statistics = json.loads((write(tmp_path, clips) / "statistics.json").read_text())
+    assert (statistics["clips"], statistics["frames"]) == (2, 32)
     wrists = np.concatenate([clip.hands["right"].wrist_m for clip in clips[:2]]).astype(np.float64)
-    right = found["quantities"]["right_wrist_m"]
+    right = statistics["quantities"]["right_wrist_m"]
     np.testing.assert_allclose(right["mean"], wrists.mean(axis=0), rtol=1e-7)
     np.testing.assert_allclose(
         right["quantile_values"], np.percentile(wrists, (1, 5, 25, 50, 75, 95, 99), axis=0).T, rtol=1e-7
     )
-    assert found["quantities"]["right_closest_m"]["mean"] == [0.004]
+    assert statistics["quantities"]["right_closest_m"]["mean"] == [0.004]
 
 
 def test_the_same_clips_give_the_same_bytes(clips, tmp_path):
-    first, second = write(tmp_path / "a", clips, wanted="text2hoi"), write(tmp_path / "b", clips, wanted="text2hoi")
+    first, second = write(tmp_path / "a", clips, choice="text2hoi"), write(tmp_path / "b", clips, choice="text2hoi")
     names = sorted(path.name for path in first.iterdir())
     assert names == ["info.json", "splits.parquet", "statistics.json"]
     assert all((first / name).read_bytes() == (second / name).read_bytes() for name in names)
@@ -146,11 +146,11 @@ def test_a_held_out_copy_of_a_training_clip_under_another_name_is_refused(clips,
 def test_a_chosen_split_that_breaks_its_promise_is_refused_but_another_only_recorded(clips, tmp_path):
     by_object = {"by": "subject", "train": ["s1"], "test": ["s10"], "promises": ["object"]}
     with pytest.raises(BadInput, match="no object in two parts, as it promises, got 1 in several: box"):
-        write(tmp_path / "refused", clips, wanted=by_object)
+        write(tmp_path / "refused", clips, choice=by_object)
     shared = replace(clips[2], sources=clips[0].sources)
     with pytest.raises(BadInput, match=r"no file in two parts.*grab/s1/cup_lift_1\.npz"):
         write(tmp_path / "shared", [clips[0], shared])
-    folder = write(tmp_path / "other", [clips[0], shared], wanted={**RULE, "promises": ["subject"]})
+    folder = write(tmp_path / "other", [clips[0], shared], choice={**RULE, "promises": ["subject"]})
     record = json.loads((folder / "info.json").read_text())["splits"]["text2hoi"]
     assert not record["keeps_its_promises"]
 
@@ -164,7 +164,7 @@ def test_an_annotation_of_other_clips_is_refused(clips, tmp_path):
 
 def test_an_unknown_split_is_refused_before_anything_is_written(clips, tmp_path):
     with pytest.raises(BadInput, match=r"composition, drawn-object, .*official, text2hoi, .*subject, got 'text2hio'"):
-        write(tmp_path, clips, wanted="text2hio")
+        write(tmp_path, clips, choice="text2hio")
     assert not (tmp_path / "splits").exists()
 
 
@@ -184,8 +184,8 @@ def test_how_complete_a_dataset_is_is_told_where_its_makers_list_the_sequences(m
     for name in ("hand_type", "text"):
         table.to_parquet(tmp_path / "annotation" / f"{name}.parquet")
     split_store(tmp_path / "clips", tmp_path / "annotation", tmp_path / "splits", "bimart")
-    told = json.loads((tmp_path / "splits" / "info.json").read_text())["published"]
-    assert (told["sequences"], told["usable"], told["with_clips"]) == (339, 301, 2)
+    published = json.loads((tmp_path / "splits" / "info.json").read_text())["published"]
+    assert (published["sequences"], published["usable"], published["with_clips"]) == (339, 301, 2)
 
 
 @pytest.mark.parametrize("moved", ["rotvec", "translation_m", "hinge_rad"])
@@ -217,7 +217,7 @@ def test_motion_is_told_apart_by_every_number_of_a_hand(make_clip, side, moved):
     ],
 )
 def test_a_part_without_clips_is_named_with_what_follows_from_it(clips, tmp_path, rule, missing):
-    info = json.loads((write(tmp_path, clips, wanted=rule) / "info.json").read_text())
+    info = json.loads((write(tmp_path, clips, choice=rule) / "info.json").read_text())
     assert list(info["missing"]) == sorted(missing)
     assert all(
         words.startswith(f"no {'training' if part == 'train' else part} clips: ")

@@ -246,7 +246,9 @@ def test_a_store_survives_pickling_without_carrying_its_arrays(folder):
 def entries(frame: list[int]) -> DistanceEntries:
     """One entry per frame named; their points are 0, 1, 2 and so on, i + 1 mm away."""
     numbers, zeros = np.arange(len(frame)), np.zeros(len(frame), np.int64)
-    return DistanceEntries(zeros, np.array(frame), zeros, numbers, np.float32(0.001 * (numbers + 1)))
+    return DistanceEntries(
+        side=zeros, frame=np.array(frame), joint=zeros, point=numbers, distance_m=np.float32(0.001 * (numbers + 1))
+    )
 
 
 @pytest.mark.parametrize("cut", [DistanceEntries.window, DistanceEntries.interval])
@@ -290,7 +292,10 @@ def test_clips_are_counted_by_object_and_verb(folder):
 
 def test_the_command_prints_them_and_all_on_request(tmp_path, clips, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
-    left_out = [Quarantined(f"test/s9/[bad]_{number}", "x.npz", "7 columns", "6", "-") for number in range(15)]
+    left_out = [
+        Quarantined(source_key=f"test/s9/[bad]_{number}", where="x.npz", expected="7 columns", got="6", remedy="-")
+        for number in range(15)
+    ]
     write_store(tmp_path / "clips", [*left_out, *clips], generated_info("test"))
     short = CliRunner().invoke(app, ["info", str(tmp_path / "clips")])
     assert short.exit_code == 0
@@ -350,7 +355,7 @@ def empty(folder: Path) -> Path:
 
 @pytest.fixture
 def dataset(tmp_path: Path) -> Path:
-    """The folders of a dataset that is not there: a store without clips, and notes in place of all else."""
+    """The folders of a dataset that is not there: a store without clips, and notes instead of all else."""
     write_store(tmp_path / "clips", [], generated_info("grab"))
     for name in ("clips", "annotation", "contact", "splits", "quality"):
         empty(tmp_path / name)
@@ -443,21 +448,21 @@ def test_one_changed_byte_anywhere_in_an_array_is_told(tmp_path: Path):
     write_npz(tmp_path / "a.npz", {name: array for name, array in ARRAYS.items() if array.size})
     whole = (tmp_path / "a.npz").read_bytes()
     expected = {name: array.copy() for name, array in map_npz(tmp_path / "a.npz").items()}
-    told = 0
-    for place in range(0, len(whole), 7):
+    refused = 0
+    for offset in range(0, len(whole), 7):
         changed = bytearray(whole)
-        changed[place] ^= 1 << place % 8
-        (tmp_path / f"{place}.npz").write_bytes(changed)
+        changed[offset] ^= 1 << offset % 8
+        (tmp_path / f"{offset}.npz").write_bytes(changed)
         try:
-            found = map_npz(tmp_path / f"{place}.npz")
+            arrays = map_npz(tmp_path / f"{offset}.npz")
         except BadInput:
-            told += 1
+            refused += 1
             continue
         # Bytes of the archive's own that nobody reads: times, versions, the lengths' second copies.
-        assert {name: array.tolist() for name, array in found.items()} == {
+        assert {name: array.tolist() for name, array in arrays.items()} == {
             name: array.tolist() for name, array in expected.items()
-        } or set(found) != set(expected)
-    assert told > 0.6 * len(whole) / 7
+        } or set(arrays) != set(expected)
+    assert refused > 0.6 * len(whole) / 7
 
 
 def test_a_file_cut_anywhere_gives_the_named_error_only(tmp_path: Path):

@@ -31,18 +31,18 @@ def change_info(key: str, value) -> Callable[[Path], None]:
     return change
 
 
-def change_table(name: str, column: str, row: int | None, value) -> Callable[[Path], None]:
-    """Set one value of a table; row None: replace the whole column (``...``: drop it)."""
+def change_table(name: str, column: str, number: int | None, value) -> Callable[[Path], None]:
+    """Set one value of a table; number None: replace the whole column (``...``: drop it)."""
 
     def change(folder: Path) -> None:
         path = folder / "meta" / f"{name}.parquet"
         table = pq.read_table(path)
         index = table.schema.get_field_index(column)
-        if row is None:
+        if number is None:
             table = table.remove_column(index) if value is ... else table.append_column(column, value)
         else:
             values = table[column].to_pylist()
-            values[row] = value(values[row]) if callable(value) else value
+            values[number] = value(values[number]) if callable(value) else value
             table = table.set_column(index, column, pa.array(values, table.schema.field(index).type))
         pq.write_table(table, path)
 
@@ -134,12 +134,12 @@ def in_objects(member: str, value) -> Fault:
     return change_arrays(OBJECTS, member, value), f"{OBJECTS}: {member}"
 
 
-def in_clips(column: str, row: int | None, value) -> Fault:
-    return change_table("sequences", column, row, value), f"{SEQ}: {column}"
+def in_clips(column: str, number: int | None, value) -> Fault:
+    return change_table("sequences", column, number, value), f"{SEQ}: {column}"
 
 
-def in_meshes(column: str, row: int | None, value) -> Fault:
-    return change_table("objects", column, row, value), f"{OBJ}: {column}"
+def in_meshes(column: str, number: int | None, value) -> Fault:
+    return change_table("objects", column, number, value), f"{OBJ}: {column}"
 
 
 def in_info(key: str, value) -> Fault:
@@ -262,7 +262,7 @@ FAULTS: dict[str, Fault] = {
     "44 finger angles": in_frames("right_hand_pose", lambda a: a[:, 1:]),
     "a flat array": in_frames("object_rotvec", np.ravel),
     "a scalar": in_frames("object_hinge_rad", lambda a: a[0]),
-    "a row less": in_frames("left_valid", lambda a: a[1:]),
+    "a number less": in_frames("left_valid", lambda a: a[1:]),
     "flags of 2": in_frames("left_valid", lambda a: (2 * a.astype(np.uint8)).view(bool)),
     "NaN in a hand that is not valid": in_frames("left_wrist_m", with_value((34, 0), np.nan)),
     "infinity": in_frames("camera_position_m", with_value((0, 0), np.inf)),
@@ -298,10 +298,10 @@ def test_a_sound_store_has_no_problems(folder, tmp_path):
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_is_found_and_named_with_its_file(folder, name):
-    break_it, where = FAULTS[name]
+    break_it, source = FAULTS[name]
     break_it(folder)
     problems = check_store(folder)
-    assert any(problem.where.startswith(where) for problem in problems), [str(problem) for problem in problems]
+    assert any(problem.where.startswith(source) for problem in problems), [str(problem) for problem in problems]
     assert all(problem.expected and problem.got and problem.remedy for problem in problems)
 
 
@@ -357,10 +357,10 @@ def test_all_faults_of_a_store_are_listed_at_once(folder):
     assert len(check_store(folder)) == 5
 
 
-def test_what_is_no_store_is_refused(tmp_path):
-    with pytest.raises(MissingResource, match="no store"):
+def test_a_folder_that_is_not_a_store_is_refused(tmp_path):
+    with pytest.raises(MissingResource, match="is not a store"):
         check_store(tmp_path)
-    with pytest.raises(MissingResource, match="no folder"):
+    with pytest.raises(MissingResource, match="is not a folder"):
         check_store(tmp_path / "none")
 
 

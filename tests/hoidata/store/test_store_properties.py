@@ -1,4 +1,4 @@
-"""What holds of any clip: writing what was read gives the same bytes, and no geometry depends on the world frame."""
+"""Properties of any clip: writing it again gives the same bytes, and no geometry depends on the world frame."""
 
 import tempfile
 from collections.abc import Callable
@@ -30,12 +30,14 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 
 def mesh(name: str, size: float, hinged: bool) -> ObjectModel:
     hinge = Hinge(np.array([0.0, 0.6, 0.8]), np.array([0.01, 0.0, 0.02])) if hinged else None
-    return ObjectModel(name, TETRAHEDRON_M * size, FACES, np.array([0, 0, 1, hinged], np.uint8), hinge)
+    return ObjectModel(
+        name=name, vertices_m=TETRAHEDRON_M * size, faces=FACES, part=np.array([0, 0, 1, hinged], np.uint8), hinge=hinge
+    )
 
 
 @st.composite
 def any_clip(draw: st.DrawFn) -> Clip:
-    """A clip of random numbers, with or without each thing a clip can have."""
+    """A clip of random numbers, with or without each optional field."""
     flags = st.booleans()
     n = draw(st.integers(1, 7))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
@@ -46,7 +48,14 @@ def any_clip(draw: st.DrawFn) -> Clip:
     def hand() -> HandTrack:
         betas = rng.normal(size=(draw(st.sampled_from((1, n))), 10)).astype(np.float32)
         template = rng.random((778, 3)).astype(np.float32) * np.float32(0.2) if draw(flags) else None
-        return HandTrack(rows(3), rows(3), 4 * rows(45), betas, rng.random(n) < 0.7, template)
+        return HandTrack(
+            wrist_m=rows(3),
+            global_orient=rows(3),
+            hand_pose=4 * rows(45),
+            betas=betas,
+            valid=rng.random(n) < 0.7,
+            template_m=template,
+        )
 
     def track() -> ObjectTrack:
         hinged = draw(flags)
@@ -59,10 +68,22 @@ def any_clip(draw: st.DrawFn) -> Clip:
 
     def camera() -> CameraTrack:
         intrinsics = rng.random(6) * 500 if draw(flags) else None
-        return CameraTrack("cam", rows(3), rows(3), rng.integers(0, 9999, n).astype(np.int32), intrinsics)
+        return CameraTrack(
+            name="cam",
+            rotvec=rows(3),
+            position_m=rows(3),
+            images=rng.integers(0, 9999, n).astype(np.int32),
+            intrinsics=intrinsics,
+        )
 
     def body() -> BodyTrack:
-        return BodyTrack(rows(3), rows(3), rows(63), rows(9), rows(10) if draw(flags) else None)
+        return BodyTrack(
+            transl_m=rows(3),
+            global_orient=rows(3),
+            body_pose=rows(63),
+            face_pose=rows(9),
+            expression=rows(10) if draw(flags) else None,
+        )
 
     gravity, fitted, number = draw(flags), draw(flags), draw(st.integers(0, 4))
     direction = rng.normal(size=3)
@@ -105,7 +126,7 @@ def test_writing_what_was_read_gives_the_same_bytes_and_a_sound_store(clips, fra
         write_store(first, clips, generated_info("any"))
         assert check_store(first) == []
         store = open_store(first)
-        left_out = [Quarantined(**row) for row in store.quarantine.to_dict("records")]
+        left_out = [Quarantined(**values) for values in store.quarantine.to_dict("records")]
         write_store(second, [*left_out, *map(store.clip, store.ids)], store.info)
         assert contents(second) == contents(first)
         assert len(store) + len(left_out) == len(clips)
@@ -116,9 +137,9 @@ def surface_m(clip: Clip, frame: int) -> np.ndarray:
     model, track = clip.object.model, clip.object
     points = np.array(model.vertices_m)
     if model.hinge is not None and track.hinge_rad is not None:
-        turn = Rotation.from_rotvec(model.hinge.axis * float(track.hinge_rad[frame]))
+        rotation = Rotation.from_rotvec(model.hinge.axis * float(track.hinge_rad[frame]))
         moving = model.part == 1
-        points[moving] = turn.apply(points[moving] - model.hinge.origin_m) + model.hinge.origin_m
+        points[moving] = rotation.apply(points[moving] - model.hinge.origin_m) + model.hinge.origin_m
     return Rotation.from_rotvec(track.rotvec[frame]).apply(points) + track.translation_m[frame]
 
 
@@ -137,13 +158,13 @@ def through_store(clip: Clip, folder: Path) -> Clip:
 def pixels(clip: Clip, points_m: np.ndarray) -> np.ndarray:
     """World points (frame, 3) as the clip's camera sees them: x / z, y / z."""
     assert clip.camera is not None
-    seen = Rotation.from_rotvec(clip.camera.rotvec).inv().apply(points_m - clip.camera.position_m)
-    return seen[:, :2] / seen[:, 2:]
+    points_camera_m = Rotation.from_rotvec(clip.camera.rotvec).inv().apply(points_m - clip.camera.position_m)
+    return points_camera_m[:, :2] / points_camera_m[:, 2:]
 
 
 @pytest.fixture
 def seen_clip(make_clip: Callable[..., Clip]) -> Clip:
-    """An articulated object in both hands, a further object, seen by a moving camera two metres behind."""
+    """An articulated object in both hands, a further object, points_camera_m by a moving camera two metres behind."""
     clip = make_clip(12, "both", articulated=True, seed=4)
     path = np.linspace((0.1, 0.2, -1.2), (0.2, 0.1, -1.1), 12).astype(np.float32)
     camera = CameraTrack("cam0", np.full((12, 3), 0.05, np.float32), path, np.arange(12, dtype=np.int32))
@@ -158,18 +179,18 @@ def points(seen_clip: Clip) -> ProximityIndex:
 def touching(clip: Clip, points: ProximityIndex, threshold_m: float) -> dict[str, set[tuple[int, ...]]]:
     """Per hand the (frame, joint, point) closer than the threshold."""
     joints = {side: track_joints(clip.hands[side], load_embedded_hands()[side]) for side in SIDES}
-    found = distance_entries(clip, joints, points, threshold_m)
-    return {side: set(found[side][["frame", "joint", "point"]].tolist()) for side in SIDES}
+    entries = distance_entries(clip, joints, points, threshold_m)
+    return {side: set(entries[side][["frame", "joint", "point"]].tolist()) for side in SIDES}
 
 
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1), reach_m=st.sampled_from((0.0, 0.5, 5.0)))
 def test_distances_and_contact_do_not_depend_on_the_world_frame(seen_clip, points, seed, reach_m):
     rng = np.random.default_rng(seed)
-    turn, shift_m = Rotation.random(rng=rng), rng.uniform(-reach_m, reach_m, 3)
+    rotation, shift_m = Rotation.random(rng=rng), rng.uniform(-reach_m, reach_m, 3)
     with tempfile.TemporaryDirectory() as folder:
         one = through_store(seen_clip, Path(folder) / "one")
-        two = through_store(in_another_world(seen_clip, turn, shift_m), Path(folder) / "two")
+        two = through_store(in_another_world(seen_clip, rotation, shift_m), Path(folder) / "two")
     np.testing.assert_allclose(joint_distances_m(two), joint_distances_m(one), atol=5e-6)
     # Float32 places a few micrometres apart may fall on either side of the threshold, no others.
     first, second = (touching(clip, points, 0.02) for clip in (one, two))
@@ -184,10 +205,10 @@ def test_distances_and_contact_do_not_depend_on_the_world_frame(seen_clip, point
 @given(seed=st.integers(0, 2**32 - 1))
 def test_the_source_the_image_and_the_fall_do_not_depend_on_the_world_frame(seen_clip, seed):
     rng = np.random.default_rng(seed)
-    turn, shift_m = Rotation.random(rng=rng), rng.uniform(-1, 1, 3)
+    rotation, shift_m = Rotation.random(rng=rng), rng.uniform(-1, 1, 3)
     with tempfile.TemporaryDirectory() as folder:
         one = through_store(seen_clip, Path(folder) / "one")
-        two = through_store(in_another_world(seen_clip, turn, shift_m), Path(folder) / "two")
+        two = through_store(in_another_world(seen_clip, rotation, shift_m), Path(folder) / "two")
     in_source = [np.c_[clip.hands["left"].wrist_m, np.ones(12)] @ clip.source_from_world.T for clip in (one, two)]
     np.testing.assert_allclose(in_source[1], in_source[0], atol=1e-6)
     for point in ("object", "left", "right"):

@@ -7,7 +7,7 @@ from hoidata.datasets.h2o.adapter import ACTIONS as H2O_LABELS
 from hoidata.synthetic.actions import ACTIONS, CASTS, H2O_ACTION_IDS, LONGEST_CLIP, MEAN_LENGTH, plan, subjects
 from hoidata.synthetic.check import explained_by_verb
 from hoidata.synthetic.paths import MOTIONS, follow_path, minimum_jerk
-from hoidata.synthetic.sequences import draw_length
+from hoidata.synthetic.sequences import sample_length
 
 DATASETS = ("h2o", "grab", "arctic")
 ARCTIC_PAIRS = {
@@ -43,7 +43,7 @@ def test_only_pairs_of_the_real_label_tables_occur():
 def test_there_are_enough_verbs_and_each_dataset_uses_left_right_and_both():
     assert len({action.verb for actions in ACTIONS.values() for action in actions}) >= 10
     for actions in ACTIONS.values():
-        assert {action.hold.hand for action in actions} == {"left", "right", "both"}
+        assert {action.grasp.hand for action in actions} == {"left", "right", "both"}
         assert len({(action.verb, action.object_name) for action in actions}) == len(actions)
 
 
@@ -51,7 +51,7 @@ def test_the_object_alone_does_not_give_the_hand():
     for dataset in DATASETS:
         hands = defaultdict(set)
         for action in ACTIONS[dataset]:
-            hands[action.object_name].add(action.hold.hand)
+            hands[action.object_name].add(action.grasp.hand)
         assert sum(len(kinds) > 1 for kinds in hands.values()) >= 2
 
 
@@ -80,7 +80,7 @@ def test_every_subject_acts_and_no_two_entries_are_equal(dataset):
 def test_the_verb_explains_most_of_the_length(dataset):
     verbs = [ACTIONS[dataset][entry.action].verb for entry in plan(dataset, "full")] * 5
     rng = np.random.default_rng(0)
-    lengths = [draw_length(dataset, verb, rng) for verb in verbs]
+    lengths = [sample_length(dataset, verb, rng) for verb in verbs]
     assert 0.5 <= explained_by_verb(verbs, lengths) < 0.95
     assert max(lengths) <= LONGEST_CLIP
     means = MEAN_LENGTH[dataset].values()
@@ -95,7 +95,7 @@ def test_paths_start_and_end_on_the_table_without_jumps(name):
     path = follow_path(motion, frames, 30.0, 80.0, False, 1.0, 1.0)
     for end in (0, -1):
         assert path.shift_m[end, 2] == pytest.approx(0.0, abs=1e-9)
-        np.testing.assert_allclose(path.turn_rad[end], 0, atol=1e-9)
+        np.testing.assert_allclose(path.rotation_rad[end], 0, atol=1e-9)
     np.testing.assert_allclose(path.shift_m[0], 0, atol=1e-9)
     speed = np.linalg.norm(np.diff(path.shift_m, axis=0), axis=1) * 120
     assert speed.max() < 1.6
@@ -107,13 +107,13 @@ def test_a_left_handed_path_is_the_mirror_image():
     right = follow_path(MOTIONS["pour"], frames, 5.0, 80.0, False, 1.1, 0.9)
     left = follow_path(MOTIONS["pour"], frames, 5.0, 80.0, True, 1.1, 0.9)
     np.testing.assert_allclose(left.shift_m, right.shift_m * [-1, 1, 1])
-    np.testing.assert_allclose(left.turn_rad, right.turn_rad * [1, -1, -1])
+    np.testing.assert_allclose(left.rotation_rad, right.rotation_rad * [1, -1, -1])
 
 
 def test_minimum_jerk_starts_and_ends_at_rest():
-    share = np.linspace(0, 1, 1001)
-    position = minimum_jerk(share)
-    velocity = np.gradient(position, share)
+    fraction = np.linspace(0, 1, 1001)
+    position = minimum_jerk(fraction)
+    velocity = np.gradient(position, fraction)
     assert (position[0], position[-1]) == (0.0, 1.0)
     assert abs(velocity[0]) < 1e-4
     assert abs(velocity[-1]) < 1e-4

@@ -15,7 +15,7 @@ from hoidata.files import sha256_file
 from hoidata.files.restricted_pickle import ARRAYS, restricted_load
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.objects.mesh import load_mesh
-from hoidata.synthetic.check import check_sequences, sequence_figures
+from hoidata.synthetic.check import check_sequences, sequence_metrics
 from hoidata.synthetic.corpus import write_corpus, write_raw_sequence, write_shared_files
 from hoidata.synthetic.generate import make_action, place_in_raw_sequences, tasks_of
 from hoidata.synthetic.grasps import closes_force
@@ -67,9 +67,9 @@ def test_every_held_frame_is_sound(truths, dataset):
 
 @pytest.mark.parametrize("dataset", ONE_ACTION)
 def test_hands_that_are_shifted_or_missing_do_not_explain_the_motion(truths, dataset):
-    figures = sequence_figures(truths[dataset])
-    assert figures.feasible == figures.held
-    assert figures.feasible_without_contact <= 0.02 * figures.held
+    figures = sequence_metrics(truths[dataset])
+    assert figures.feasible == figures.lifted
+    assert figures.feasible_without_contact <= 0.02 * figures.lifted
     far = measure(truths[dataset], load_embedded_hands(), np.array([0.0, 0.0, 0.3]))
     assert not far.is_sound
     assert (far.residual > 0.01).all()
@@ -81,7 +81,7 @@ def test_while_held_the_hand_does_not_move_against_the_object(truths, dataset):
     frames = np.arange(*truth.contact)
     track = truth.object
     rotation = Rotation.from_rotvec(track.rotvec[frames])
-    for side in truth.acting_sides:
+    for side in truth.active_sides:
         local = rotation.inv().apply(truth.hands[side].wrist_m[frames] - track.translation_m[frames])
         assert np.abs(local - local[0]).max() < 1e-9
 
@@ -89,7 +89,7 @@ def test_while_held_the_hand_does_not_move_against_the_object(truths, dataset):
 @pytest.mark.parametrize("dataset", ONE_ACTION)
 def test_contact_lasts_from_the_frame_in_which_the_hand_is_closed_to_the_last_before_it_opens(truths, dataset):
     truth = truths[dataset]
-    for side in truth.acting_sides:
+    for side in truth.active_sides:
         pose = truth.hands[side].hand_pose
         closed = np.abs(pose - pose[sum(truth.contact) // 2]).max(axis=1) < 1e-12
         np.testing.assert_array_equal(np.flatnonzero(closed), np.arange(*truth.contact))
@@ -107,7 +107,7 @@ def test_an_idle_left_hand_is_the_mirror_image_of_a_right_one():
 def test_equal_seeds_give_equal_sequences_and_other_seeds_others(truths, dataset):
     again = _one(dataset)
     np.testing.assert_array_equal(again.object.translation_m, truths[dataset].object.translation_m)
-    side = again.acting_sides[0]
+    side = again.active_sides[0]
     np.testing.assert_array_equal(again.hands[side].hand_pose, truths[dataset].hands[side].hand_pose)
 
 
@@ -117,17 +117,17 @@ def test_raw_files_read_frame_by_frame_as_the_field_reads_them_give_the_hands_an
 ):
     """With the formulas of the datasets, not the adapters': a mirrored hand, a swapped side or another unit shows."""
     truth, pair = truths[dataset], load_embedded_hands()
-    own = np.linspace(*truth.contact, 3, endpoint=False).astype(int)
-    found = READERS[dataset](root / dataset, truth.source_key, own + truth.raw_start, NaiveHands(pair))
+    sampled_frames = np.linspace(*truth.contact, 3, endpoint=False).astype(int)
+    read_back = READERS[dataset](root / dataset, truth.source_key, sampled_frames + truth.raw_start, NaiveHands(pair))
     sides = [number for number, side in enumerate(SIDES) if truth.hands[side].valid.all()]
-    assert {SIDES[number] for number in sides} >= set(truth.acting_sides)
+    assert {SIDES[number] for number in sides} >= set(truth.active_sides)
     for number in sides:
-        expected = truth.joints(pair)[SIDES[number]][own]
-        np.testing.assert_allclose(found.joints_m[:, number], expected, atol=4e-3 if dataset == "grab" else 2e-6)
-        np.testing.assert_allclose(found.joints_m[:, number, 0], expected[:, 0], atol=2e-6)
-    pose = found.object_pose
-    np.testing.assert_allclose(pose[:, :3, 3], truth.object.translation_m[own], atol=2e-6)
-    turns = Rotation.from_rotvec(truth.object.rotvec[own]).as_matrix()
+        expected = truth.joints(pair)[SIDES[number]][sampled_frames]
+        np.testing.assert_allclose(read_back.joints_m[:, number], expected, atol=4e-3 if dataset == "grab" else 2e-6)
+        np.testing.assert_allclose(read_back.joints_m[:, number, 0], expected[:, 0], atol=2e-6)
+    pose = read_back.object_pose
+    np.testing.assert_allclose(pose[:, :3, 3], truth.object.translation_m[sampled_frames], atol=2e-6)
+    turns = Rotation.from_rotvec(truth.object.rotvec[sampled_frames]).as_matrix()
     np.testing.assert_allclose(pose[:, :3, :3], turns, atol=2e-6)
 
 

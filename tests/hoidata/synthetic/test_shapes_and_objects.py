@@ -100,8 +100,8 @@ def test_arctic_objects_turn_about_minus_z_through_their_origin_without_cutting_
     np.testing.assert_array_equal(model.hinge.origin_m, 0)
     base, lid = (model.faces[model.face_part == part] for part in (0, 1))
     for angle in (0.0, 0.35, 0.95):
-        turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-        moved = model.vertices_m[np.unique(lid)] @ turn.T
+        rotmat = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        moved = model.vertices_m[np.unique(lid)] @ rotmat.T
         assert igl_signed_m(model.vertices_m, base, moved).min() > -1e-6
 
 
@@ -130,10 +130,10 @@ def test_a_mirrored_field_is_the_field_of_the_mirrored_object():
     model = object_model("grab", "mug")
     turned_round = grid_field(PartSurface(model.vertices_m * [-1, 1, 1], model.faces[:, ::-1], True, 0))
     points = np.random.default_rng(1).uniform(-0.08, 0.1, (600, 3))
-    seen, wanted = mirrored(grid_field(surface_index(model).filled[0]))(points), turned_round(points)
-    near = wanted < 0.025
+    actual, expected = mirrored(grid_field(surface_index(model).filled[0]))(points), turned_round(points)
+    near = expected < 0.025
     assert near.sum() > 40
-    assert np.abs(seen - wanted)[near].max() < 0.003
+    assert np.abs(actual - expected)[near].max() < 0.003
 
 
 def test_the_gradient_of_a_ball_points_away_from_its_middle():

@@ -24,10 +24,10 @@ from tests.builders.objects import igl_signed_m
 DATASETS = tuple(STUDY_OBJECTS)
 TEST, VALIDATION = {"s10"}, {"s9", "s05"}
 REGIONS = [
-    (dataset, row, region.name)
-    for dataset, things in STUDY_OBJECTS.items()
-    for row, thing in enumerate(things)
-    for region in thing.all_regions
+    (dataset, index, region.name)
+    for dataset, objects in STUDY_OBJECTS.items()
+    for index, item in enumerate(objects)
+    for region in item.all_regions
 ]
 
 
@@ -37,9 +37,9 @@ def _plans():
 
 def test_there_are_enough_verbs_objects_and_clips_of_disjoint_subjects():
     assert len(VERBS) >= 10
-    things = [thing for things in STUDY_OBJECTS.values() for thing in things]
-    assert len({thing.spec.name for thing in things}) == len(things) >= 12
-    assert sum(thing.spec.lid is not None for thing in things) >= 4
+    objects = [item for objects in STUDY_OBJECTS.values() for item in objects]
+    assert len({item.spec.name for item in objects}) == len(objects) >= 12
+    assert sum(item.spec.lid is not None for item in objects) >= 4
     parts = Counter(
         "test" if entry.subject in TEST else "validation" if entry.subject in VALIDATION else "train"
         for _, entry in _plans()
@@ -55,47 +55,47 @@ def test_there_are_enough_verbs_objects_and_clips_of_disjoint_subjects():
 def test_neither_object_nor_hand_tells_the_verb_and_all_three_do_not_tell_the_region():
     verbs, regions, hands = defaultdict(Counter), defaultdict(set), defaultdict(set)
     for dataset, entry in _plans():
-        key = (dataset, entry.thing, entry.hand)
+        key = (dataset, entry.object_index, entry.hand)
         if entry.subject in TEST:
             verbs[key][entry.verb] += 1
         elif entry.subject not in VALIDATION:
             regions[*key, entry.verb].add(entry.region)
-            hands[dataset, entry.thing, entry.verb].add(entry.hand)
+            hands[dataset, entry.object_index, entry.verb].add(entry.hand)
     usual = sum(max(counts.values()) for counts in verbs.values())
     assert usual <= 0.5 * sum(sum(counts.values()) for counts in verbs.values())
     assert all(len(counts) >= 3 for counts in verbs.values())
-    assert np.mean([len(found) >= 2 for found in regions.values()]) > 0.95
-    assert all(len(found) == 3 for (_, _, verb), found in hands.items() if verb != HANDOVER)
+    assert np.mean([len(values) >= 2 for values in regions.values()]) > 0.95
+    assert all(len(values) == 3 for (_, _, verb), values in hands.items() if verb != HANDOVER)
 
 
 def test_what_is_tested_was_also_trained_on_and_no_two_clips_have_one_name():
     for dataset in DATASETS:
         entries = study_plan(dataset, "study")
-        trained = {(e.thing, e.verb, e.hand) for e in entries if e.subject not in TEST | VALIDATION}
-        assert {(e.thing, e.verb, e.hand) for e in entries} == trained
-        names = [(entry.subject, entry.thing, entry.verb, entry.number) for entry in entries]
+        trained = {(e.object_index, e.verb, e.hand) for e in entries if e.subject not in TEST | VALIDATION}
+        assert {(e.object_index, e.verb, e.hand) for e in entries} == trained
+        names = [(entry.subject, entry.object_index, entry.verb, entry.number) for entry in entries]
         assert len(set(names)) == len(names)
 
 
-@pytest.mark.parametrize(("dataset", "row", "region"), REGIONS)
-def test_every_object_is_its_own_mirror_image_as_it_stands(dataset, row, region):
-    thing = STUDY_OBJECTS[dataset][row]
-    symmetry = thing.mirror(next(item for item in thing.all_regions if item.name == region))
+@pytest.mark.parametrize(("dataset", "index", "region"), REGIONS)
+def test_each_object_equals_its_mirror_image(dataset, index, region):
+    item = STUDY_OBJECTS[dataset][index]
+    symmetry = item.mirror(next(candidate for candidate in item.all_regions if candidate.name == region))
     assert np.linalg.det(symmetry) == pytest.approx(-1)
-    model = model_of(thing.spec)
+    model = model_of(item.spec)
     for part in model.parts:
-        own = model.vertices_m[model.part == part]
-        away = igl_signed_m(model.vertices_m, model.faces_of(part), own @ symmetry.T)
+        part_vertices = model.vertices_m[model.part == part]
+        away = igl_signed_m(model.vertices_m, model.faces_of(part), part_vertices @ symmetry.T)
         assert np.abs(away).max() < 5e-4
     if model.hinge is not None:  # a lid opened in the mirror is a lid opened as far
         np.testing.assert_allclose(-symmetry @ model.hinge.axis, model.hinge.axis, atol=1e-9)
 
 
 def test_regions_of_an_object_have_names_of_their_own():
-    for things in STUDY_OBJECTS.values():
-        for thing in things:
-            names = [region.name for region in thing.all_regions]
-            assert len(set(names)) == len(names), thing.spec.name
+    for objects in STUDY_OBJECTS.values():
+        for item in objects:
+            names = [region.name for region in item.all_regions]
+            assert len(set(names)) == len(names), item.spec.name
 
 
 @pytest.mark.parametrize("verb", sorted(VERBS))
@@ -124,7 +124,7 @@ def test_every_verb_has_limits_for_what_its_object_does():
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def corpora(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study")
     return {
         dataset: (folder / dataset, write_corpus(dataset, folder / dataset, 1, "study-small", jobs=1))
@@ -137,15 +137,15 @@ def _digests(root) -> dict[str, str]:
 
 
 @pytest.mark.long
-def test_a_study_corpus_is_the_same_bytes_for_any_number_of_jobs(made, tmp_path):
+def test_a_study_corpus_is_the_same_bytes_for_any_number_of_jobs(corpora, tmp_path):
     write_corpus("arctic", tmp_path / "together", 1, "study-small", jobs=2)
-    assert _digests(made["arctic"][0]) == _digests(tmp_path / "together")
+    assert _digests(corpora["arctic"][0]) == _digests(tmp_path / "together")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dataset", DATASETS)
-def test_a_study_corpus_is_sound_and_its_controls_fail(dataset, made):
-    sequences = made[dataset][1]
+def test_a_study_corpus_is_sound_and_its_controls_fail(dataset, corpora):
+    sequences = corpora[dataset][1]
     assert [truth.hand_type for truth in sequences] == [entry.hand for entry in study_plan(dataset, "study-small")]
     assert all(measure(truth, load_embedded_hands()).is_sound for truth in sequences)
     figures = check_sequences(sequences).iloc[0]
@@ -161,11 +161,11 @@ def test_a_study_corpus_is_sound_and_its_controls_fail(dataset, made):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dataset", DATASETS)
-def test_clips_begin_before_contact_and_end_after_it_with_fingers_that_close(dataset, made):
+def test_clips_begin_before_contact_and_end_after_it_with_fingers_that_close(dataset, corpora):
     pair = load_embedded_hands()
-    for truth in made[dataset][1]:
+    for truth in corpora[dataset][1]:
         clip = truth.take(truth.clip_frames)
-        for side in clip.acting_sides:
+        for side in clip.active_sides:
             away = vertex_distances_m(clip.object, track_joints(clip.hands[side], pair[side]))
             assert away[0].min() > 0.02
             assert away[-1].min() > 0.02
@@ -175,19 +175,19 @@ def test_clips_begin_before_contact_and_end_after_it_with_fingers_that_close(dat
 
 
 def test_a_handover_goes_from_one_region_to_another_and_the_object_stands_the_same_for_both():
-    handed = [thing for thing in STUDY_OBJECTS["grab"] if HANDOVER in verbs_of(thing, "both")]
+    handed = [item for item in STUDY_OBJECTS["grab"] if HANDOVER in verbs_of(item, "both")]
     assert len(handed) >= 6
-    for thing in handed:
-        ways = choices(thing, HANDOVER, "both")
+    for item in handed:
+        ways = choices(item, HANDOVER, "both")
         assert len(ways) >= 2
-        assert all(given.name != taken.name for given, taken in ways)
+        assert all(giving.name != taking.name for giving, taking in ways)
 
 
 @pytest.mark.slow
-def test_an_idle_hand_may_be_near_but_never_so_near_that_it_counts(made):
+def test_an_idle_hand_may_be_near_but_never_so_near_that_it_counts(corpora):
     pair = load_embedded_hands()
-    for _, sequences in made.values():
+    for _, sequences in corpora.values():
         for truth in sequences:
-            for side in set(SIDES) - set(truth.acting_sides):
+            for side in set(SIDES) - set(truth.active_sides):
                 joints = track_joints(truth.hands[side], pair[side])
                 assert vertex_distances_m(truth.object, joints).min() > 0.025
