@@ -20,8 +20,8 @@ from bench.bimart_baselines import CAMS_B, MDM_B, OMOMO_B
 from bench.harness import show
 from hoidata.files.written import read_json
 from hoidata.hands import HandPair
-from hoidata.metrics.asked_metrics import with_lists
 from hoidata.metrics.evaluate import evaluate_store
+from hoidata.metrics.optional_metrics import with_lists
 from hoidata.settings import build_config
 from models.common.checkpoints import FILE_NAME
 from models.common.family import Family, Network

@@ -39,7 +39,10 @@ RENAMED_KEYS: dict[str, tuple[str, ...]] = {
     "rows": ("steps_per_clip",),
     "rule": ("guidance_rule",),
     "thin_contact": ("subsample_contact",),
-    "told": ("condition_on_hands_and_length", "condition_on_hands",),
+    "told": (
+        "condition_on_hands_and_length",
+        "condition_on_hands",
+    ),
     "touch": ("contact_target",),
     "verbs": ("verb_count",),
     "window": ("window_frames",),

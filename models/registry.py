@@ -1,4 +1,4 @@
-"""All model families: the one table that names them, and where they are. Other packages add theirs by an entry point.
+"""Registry of model families and networks. Other packages add families with an entry point:
 
 ``[project.entry-points."hoidata.families"]  mine = "my_package.family:MINE"``.
 """
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from hoidata.errors import BadInput
 
-# Asking where a family is must not load torch: the stage that digests the code does so each time.
+# Finding the module of a family must not load torch: the stage that digests the code does it on every run.
 if TYPE_CHECKING:
     from models.common.family import Family, Network
 
@@ -19,7 +19,7 @@ FAMILIES = {
     "text2hoi": "models.text2hoi.family:TEXT2HOI",
     "text2hoi-coarse": "models.text2hoi.family:COARSE",
     "other-prompt": "models.text2hoi.family:OTHER_PROMPT",
-    "nearest-clip": "models.baselines.lookups:NEAREST_CLIP",
+    "nearest-clip": "models.baselines.retrieval:NEAREST_CLIP",
     "mean-motion": "models.baselines.families:MEAN_MOTION",
     "mean-pose": "models.baselines.families:MEAN_POSE",
     "ground-truth": "models.baselines.families:GROUND_TRUTH",
@@ -29,17 +29,17 @@ FAMILIES = {
     "nearest-window": "models.bimart.retrieval:NEAREST_WINDOW",
     "nearest-window-refined": "models.bimart.retrieval:NEAREST_REFINED",
     "mean-pose-at-object": "models.bimart.retrieval:OBJECT_MEAN_POSE",
-    # Rows that show what a figure sees: each must lose somewhere.
+    # Negative controls and retrieval baselines: each is expected to be worse in some metric.
     "one-call": "models.text2hoi.controls:ONE_CALL",
     "other-contact": "models.text2hoi.controls:OTHER_CONTACT",
     "other-prompt-own-contact": "models.text2hoi.controls:OTHER_PROMPT_OWN_CONTACT",
-    "prompt-lookup": "models.baselines.lookups:PROMPT_LOOKUP",
+    "prompt-lookup": "models.baselines.retrieval:PROMPT_LOOKUP",
     "prompt-lookup-held": "models.text2hoi.controls:PROMPT_LOOKUP_HELD",
-    "verb-lookup": "models.baselines.lookups:VERB_LOOKUP",
+    "verb-lookup": "models.baselines.retrieval:VERB_LOOKUP",
     "verb-lookup-held": "models.text2hoi.controls:VERB_LOOKUP_HELD",
-    "random-clip": "models.baselines.lookups:RANDOM_CLIP",
-    "other-verb": "models.baselines.lookups:OTHER_VERB",
-    "swapped-hands": "models.baselines.lookups:SWAPPED_HANDS",
+    "random-clip": "models.baselines.retrieval:RANDOM_CLIP",
+    "other-verb": "models.baselines.retrieval:OTHER_VERB",
+    "swapped-hands": "models.baselines.retrieval:SWAPPED_HANDS",
     "static": "models.baselines.controls:STATIC",
     "reversed": "models.baselines.controls:REVERSED",
     "object-moved": "models.baselines.controls:OBJECT_MOVED",
@@ -54,7 +54,7 @@ FAMILIES = {
     "bimart-other-object": "models.bimart.family:OTHER_OBJECT",
     "bimart-zero-map": "models.bimart.family:ZERO_MAP",
 }
-# Each in a module of its own, so that a change of one trains no other again.
+# One module per network, so that changing one does not train the others again.
 NETWORKS = {
     "contact": "models.text2hoi.contact_training:CONTACT",
     "length": "models.text2hoi.length:LENGTH",
@@ -67,35 +67,35 @@ NETWORKS = {
 
 
 def family_names() -> list[str]:
-    """Names of all known families, built-in ones first."""
+    """Names of all families, built-in ones first."""
     return [*FAMILIES, *sorted(point.name for point in _added())]
 
 
 def family_module(name: str) -> str:
-    """The module that defines a family, for a built-in one or another package's."""
+    """The module that defines a family, built in or added by a package."""
     return _address(name).partition(":")[0]
 
 
 def network_modules(name: str) -> list[str]:
-    """The module that defines a network; for one of another package, those of all families that may hold it."""
+    """The module that defines a built-in network; otherwise the modules of all added families, which may define it."""
     return [address.partition(":")[0] for address in _addresses_of_network(name)]
 
 
 def load_family(name: str) -> "Family":
-    """A family by name. Raises BadInput that lists the known ones."""
+    """Load a family by name. Raises BadInput that lists the registered ones."""
     return _load(_address(name))
 
 
 def load_network(name: str) -> "Network":
-    """A network by its name, of whatever family. Raises BadInput that lists the known ones."""
+    """Load a network by name, of any family. Raises BadInput that lists the registered ones."""
     if name in NETWORKS:
         return _load(NETWORKS[name])
     added = [network for address in _addresses_of_network(name) for network in _load(address).networks]
-    found = {network.name: network for network in added}
-    if name not in found:
-        known = ", ".join([*NETWORKS, *sorted(found)])
-        raise BadInput("network", f"one of {known}", name, "correct the name")
-    return found[name]
+    by_name = {network.name: network for network in added}
+    if name not in by_name:
+        names = ", ".join([*NETWORKS, *sorted(by_name)])
+        raise BadInput("network", f"one of {names}", name, "correct the name")
+    return by_name[name]
 
 
 def _load(address: str) -> Any:
@@ -116,5 +116,5 @@ def _address(name: str) -> str:
 
 @cache
 def _added() -> list[EntryPoint]:
-    """Entry points of other packages, looked for once a process; a built-in name cannot be taken over."""
+    """Entry points of other packages, read once per process; they cannot replace a built-in name."""
     return [point for point in entry_points(group=ENTRY_POINT_GROUP) if point.name not in FAMILIES]

@@ -36,7 +36,7 @@ from models.manipnet.training import MANIPNET
 from models.manipnet.trajectory_files import ENDINGS, Axes, TrajectoryFile, read_trajectories
 from pipelines.command_inputs import MeshOptions, ProjectData, stored_object, trained_on, trained_run
 from pipelines.pages.motion_files import ARRAYS as SHARED
-from pipelines.pages.motion_files import MotionFiles, drawn, hand_shapes, motion_arrays, write_motions
+from pipelines.pages.motion_files import MotionFiles, hand_shapes, motion_arrays, simplified_for_page, write_motions
 from pipelines.pages.player import motion_player
 from pipelines.showing import find_clip
 from pipelines.stages.base import StagePaths, load_hands
@@ -133,7 +133,7 @@ def animate_files(
         title=clip.clip_id,
         ghost=bool(ghosts),
         notes=animation.notes,
-        player=motion_player(drawn(clip), hands, clip.clip_id, ghosts=ghosts),
+        player=motion_player(simplified_for_page(clip), hands, clip.clip_id, ghosts=ghosts),
         facts=[*animation.facts, length, ("hand model", hands.name)],
     )
 

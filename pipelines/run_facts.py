@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from hoidata.files.written import read_json
-from pipelines.figures import LEADING, read_metrics
+from pipelines.metrics_files import LEADING, read_metrics
 from pipelines.pages.metrics_table import markdown_table
 from pipelines.params import read_params
 from pipelines.stages.families import families_of

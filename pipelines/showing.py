@@ -1,4 +1,4 @@
-"""A clip's id, or a dataset's name, to the page that shows it."""
+"""Writes the page of a clip or a dataset for ``hoidata show``."""
 
 import difflib
 from pathlib import Path
@@ -21,26 +21,34 @@ from pipelines.stages.base import StagePaths, empty_reason, load_hands
 CLOSEST = 5
 
 
-def write_shown(what: str, profile: str, out: Path) -> Path:
-    """Write the page of the clip, or of the dataset, called ``what`` in ``profile`` below ``out``; returns its path.
+def write_shown(name: str, profile: str, out: Path) -> Path:
+    """Write the page of the clip or dataset ``name`` of a profile to the folder ``out``; returns its path.
 
-    Raises BadInput that names the closest ids for an unknown one, MissingResource for a stage that has not run.
+    Raises:
+        BadInput: the name is unknown; the message lists the closest ids.
+        MissingResource: a stage has not run.
     """
-    datasets = [str(name) for name in read_params(Path())["datasets"]]
-    if what in datasets:
-        paths = StagePaths(profile, what)
-        return write_dataset_page(out, paths.data, what, load_hands(profile), dataset_title(what))
-    if (paths := _find_sequence(what, profile)) is not None:
+    datasets = [str(dataset) for dataset in read_params(Path())["datasets"]]
+    if name in datasets:
+        paths = StagePaths(profile, name)
+        return write_dataset_page(out, paths.data, name, load_hands(profile), dataset_title(name))
+    if (paths := _find_sequence(name, profile)) is not None:
         annotated = load_annotated(paths.data, load_hands(profile))
-        return write_sequence_page(out / page_name(what), annotated, what.partition("/")[2])
-    paths = find_clip(what, profile, datasets)
+        return write_sequence_page(out / page_name(name), annotated, name.partition("/")[2])
+    paths = find_clip(name, profile, datasets)
     hands = load_hands(profile)
-    return write_clip_page(out / page_name(what), load_annotated(paths.data, hands), what, hands)
+    return write_clip_page(out / page_name(name), load_annotated(paths.data, hands), name, hands)
 
 
 def write_shown_of(folder: Path, clip_id: str, hands: HandPair, out: Path) -> Path:
-    """Write the page of a clip of ``folder``, an annotated dataset or a bare store, below ``out``; without an id that
-    of the whole dataset. Raises BadInput as ``write_shown`` does.
+    """Write the page of a clip of ``folder`` to the folder ``out``; without an id, the page of the dataset.
+
+    Args:
+        folder: an annotated dataset, or a store of clips.
+        clip_id: "" for the dataset.
+
+    Raises:
+        BadInput: as in ``write_shown``.
     """
     is_store = (folder / "meta").is_dir()
     store = open_store(folder if is_store else folder / "clips", hands)
@@ -48,7 +56,7 @@ def write_shown_of(folder: Path, clip_id: str, hands: HandPair, out: Path) -> Pa
         annotated = load_annotated(folder, hands)
         return write_sequence_page(out / page_name(clip_id), annotated, clip_id.partition("/")[2])
     if clip_id and clip_id not in store.sequences.index:
-        raise _unknown(clip_id, str(folder), {str(store.info["dataset"]): store})
+        raise _unknown_id(clip_id, str(folder), {str(store.info["dataset"]): store})
     if is_store:
         return write_stored_clip(out, store, clip_id, hands)
     if clip_id:
@@ -58,10 +66,10 @@ def write_shown_of(folder: Path, clip_id: str, hands: HandPair, out: Path) -> Pa
 
 
 def write_stored_clip(out: Path, store: Store, clip_id: str, hands: HandPair) -> Path:
-    """The page of a clip of a store that is not annotated: its motion and what is known of it."""
+    """Write the page of a clip of a store without annotation: its motion and facts."""
     if not clip_id:
-        near = ", ".join(store.ids[:CLOSEST])
-        raise BadInput("CLIP", f"the id of one of {len(store)} clips", "none", f"name one, such as {near}")
+        examples = ", ".join(store.ids[:CLOSEST])
+        raise BadInput("CLIP", f"the id of one of {len(store)} clips", "none", f"name one, such as {examples}")
     clip = store.clip(clip_id)
     title = f"{clip.verb or 'move'}: {clip.object_words}"
     facts = [
@@ -95,39 +103,38 @@ def _is_sequence(store: Store, name: str) -> bool:
 
 
 def find_clip(clip_id: str, profile: str, datasets: list[str]) -> StagePaths:
-    """The dataset that holds a clip."""
+    """The dataset that has a clip."""
     stores = {name: store for name in datasets if (store := _store(StagePaths(profile, name))) is not None}
     for name, store in stores.items():
         if clip_id in store.sequences.index:
             return StagePaths(profile, name)
     if not stores:
         raise MissingResource(f"no dataset of the profile {profile} is converted; run `dvc repro` first")
-    raise _unknown(clip_id, f"the profile {profile}", stores)
+    raise _unknown_id(clip_id, f"the profile {profile}", stores)
 
 
 def _store(paths: StagePaths) -> Store | None:
-    """The clips of a dataset, or None where there are none."""
+    """The store of a dataset, or None if it has no clips."""
     if empty_reason(paths.clips) or not (paths.clips / "meta" / "info.json").is_file():
         return None
     return open_store(paths.clips)
 
 
-def _unknown(clip_id: str, where: str, stores: dict[str, Store]) -> BadInput:
-    left_out = [
-        row for store in stores.values() for row in store.quarantine.to_dict("records") if row["source_key"] == clip_id
-    ]
-    if left_out:
-        row = left_out[0]
-        got = f"left out when converting: {row['where']}: expected {row['expected']}, got {row['got']}"
-        return BadInput(clip_id, "a clip", got, str(row["remedy"]))
+def _unknown_id(clip_id: str, source: str, stores: dict[str, Store]) -> BadInput:
+    """The error for an unknown id: why the sequence was skipped in conversion, or the closest ids."""
+    for store in stores.values():
+        for skipped in store.quarantine.to_dict("records"):
+            if skipped["source_key"] == clip_id:
+                reason = f"{skipped['where']}: expected {skipped['expected']}, got {skipped['got']}"
+                return BadInput(clip_id, "a clip", f"skipped in conversion: {reason}", str(skipped["remedy"]))
     counts = ", ".join(f"{name} {len(store)}" for name, store in stores.items())
-    near = closest_ids(clip_id, [known for store in stores.values() for known in store.ids])
-    expected = f"the id of one of the clips of {where} ({counts}) or a dataset"
-    return BadInput("CLIP", expected, clip_id, f"closest: {', '.join(near)}")
+    closest = closest_ids(clip_id, [existing for store in stores.values() for existing in store.ids])
+    expected = f"the id of one of the clips of {source} ({counts}) or a dataset"
+    return BadInput("CLIP", expected, clip_id, f"closest: {', '.join(closest)}")
 
 
-def closest_ids(wanted: str, known: list[str]) -> list[str]:
-    """Up to five ids: those that hold the wanted words first, then those spelt most alike."""
-    holding = [name for name in known if wanted.lower() in name.lower()]
-    alike = difflib.get_close_matches(wanted, known, n=CLOSEST, cutoff=0.0)
-    return list(dict.fromkeys([*holding[:CLOSEST], *alike]))[:CLOSEST]
+def closest_ids(query: str, ids: list[str]) -> list[str]:
+    """Up to five ids: those that contain the query first, then those with the most similar spelling."""
+    containing = [name for name in ids if query.lower() in name.lower()]
+    similar = difflib.get_close_matches(query, ids, n=CLOSEST, cutoff=0.0)
+    return list(dict.fromkeys([*containing[:CLOSEST], *similar]))[:CLOSEST]

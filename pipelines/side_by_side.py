@@ -1,6 +1,6 @@
-"""The graph side by side: DVC runs single stages as soon as their inputs are ready.
+"""Runs the DVC graph in parallel: each stage starts as soon as its inputs are ready.
 
-Which stages there are, their order and what is stale is asked of DVC; nothing of it is written down here.
+DVC provides the stages, their order and their state.
 """
 
 import contextvars
@@ -31,41 +31,47 @@ RUN = Path(".hoidata/repro")
 RWLOCK = Path(".dvc/tmp/rwlock")
 LOGS = Path(".hoidata/logs")
 DURATIONS = Path(".hoidata/durations.json")
-# What every run of a single stage would import anew, about a second each time.
+# Imported once: importing them in every stage's process takes about a second.
 PRELOADED = ["dvc.cli", "dvc.commands.repro", "dvc.repo.reproduce", "dvc.output", "dvc.stage.run"]
 TAIL = 15
 STOP_S = 5.0
-_STARTING = threading.Lock()
-_ROOM = 1 << 20  # bytes that must fit beside the cache before anything is begun
+_START_LOCK = threading.Lock()
+_PROBE_BYTES = 1 << 20  # bytes of free space on the disk of the cache that are required before a stage starts
 Upstream = Mapping[str, frozenset[str]]
 RunStage = Callable[[str], int]
 
 
 @dataclass
 class Run:
-    """What happened: seconds of each stage that was tried, exit codes of those that failed, seconds in all."""
+    """The outcome of a run."""
 
-    seconds: dict[str, float] = field(default_factory=dict)
-    failed: dict[str, int] = field(default_factory=dict)
-    wall: float = 0.0
+    seconds: dict[str, float] = field(default_factory=dict)  # by started stage
+    failed: dict[str, int] = field(default_factory=dict)  # exit code by failed stage
+    wall: float = 0.0  # seconds of the whole run
 
 
 def reproduce_side_by_side(
     targets: list[str], jobs: int, wrap: Callable[[RunStage], RunStage] | None = None, force: bool = False
 ) -> Run:
-    """Bring the targets (all when empty) up to date, up to ``jobs`` stages at once. Bytes do not depend on ``jobs``.
+    """Bring the targets up to date with up to ``jobs`` parallel stages; the bytes do not depend on ``jobs``.
 
-    wrap: makes of the function that runs one stage the one that is called for each, for instance a Prefect task.
-    force: run the targets (all that is needed when empty) even where DVC finds nothing changed.
-    A stage that fails stops what follows from it and nothing else. Raises BadInput when another run is under way here.
+    A failed stage stops only the stages that depend on it.
+
+    Args:
+        targets: stages; empty for all.
+        wrap: decorates the function that runs one stage, for instance as a Prefect task.
+        force: run the targets even if DVC finds them unchanged.
+
+    Raises:
+        BadInput: another run is in progress in this project.
     """
-    # Left in the opposite order: running stages are stopped before the threads that wait for them are.
+    # Exited in reverse order: running stages are stopped before the threads that wait for them.
     with exclusive(RUN, wait_s=0), ThreadPoolExecutor(jobs) as pool, _Children(max(1, _cores() // jobs)) as children:
         forget_broken_lock()
         run_stage = wrap(children.run) if wrap else children.run
         start, run = time.monotonic(), Run()
         if _timed(CODE, run_stage, run):
-            _tell(CODE, run, 0)
+            _report_stage(CODE, run, 0)
         else:
             upstream = stale_stages(targets, children.forced if force else None)
             if len(upstream) > jobs:
@@ -77,15 +83,15 @@ def reproduce_side_by_side(
 
 
 def forget_broken_lock() -> None:
-    """Remove DVC's file of who reads and writes what, where a process that was killed has left half of it.
+    """Remove DVC's lock file of readers and writers if a killed process left it incomplete.
 
-    It is kept for processes that run; a broken one keeps every later run from starting.
+    An incomplete file would prevent all later runs; a complete one belongs to running processes and stays.
     """
     if not _is_broken(RWLOCK):
         return
     from dvc.lock import make_lock
 
-    # Under DVC's own guard: whoever writes it at this moment has it.
+    # Under DVC's guard lock, so that no process is writing the file now.
     with make_lock(f"{RWLOCK}.lock", tmp_dir=str(RWLOCK.parent)):
         if _is_broken(RWLOCK):
             RWLOCK.unlink()
@@ -101,10 +107,15 @@ def _is_broken(path: Path) -> bool:
 
 
 def stale_stages(targets: list[str], forced: set[str] | None = None) -> dict[str, frozenset[str]]:
-    """Stages the targets need that DVC finds changed, and all that follow from them, each with those it waits for.
+    """The stages that must run for the targets, each with the stages that it waits for.
 
-    forced: filled with the names of the targets, which then count as changed. Raises BadInput for targets that DVC
-    does not know, and while another DVC command holds the project.
+    These are the stages that DVC finds changed and all that depend on them.
+
+    Args:
+        forced: is filled with the names of the targets, which then count as changed.
+
+    Raises:
+        BadInput: a target does not exist, or another DVC command has locked the project.
     """
     from dvc.exceptions import DvcException
 
@@ -122,16 +133,16 @@ def _ask_dvc(targets: list[str], forced: set[str] | None) -> dict[str, frozenset
 
     with Repo() as repo, repo.lock:
         graph = get_active_graph(repo.index.graph)
-        asked = collect_stages(repo, targets or ["dvc.yaml"])
-        stages = plan_repro(graph, asked)
+        target_stages = collect_stages(repo, targets or ["dvc.yaml"])
+        stages = plan_repro(graph, target_stages)
         needed = graph.subgraph(stages)
         if forced is not None:
-            forced.update(stage.addressing for stage in (asked if targets else stages))
-        known = {CODE, *(forced or ())}
-        changed = [stage for stage in stages if stage.addressing not in known and stage.changed()]
-        changed += [stage for stage in stages if stage.addressing in known - {CODE}]
+            forced.update(stage.addressing for stage in (target_stages if targets else stages))
+        exempt = {CODE, *(forced or ())}
+        changed = [stage for stage in stages if stage.addressing not in exempt and stage.changed()]
+        changed += [stage for stage in stages if stage.addressing in exempt - {CODE}]
         if changed:
-            _try_writing(Path(repo.cache.local.path))
+            _check_writable(Path(repo.cache.local.path))
         stale = set(changed).union(*(networkx.ancestors(needed, stage) for stage in changed))
         return {
             stage.addressing: frozenset(other.addressing for other in needed.successors(stage) if other in stale)
@@ -140,17 +151,17 @@ def _ask_dvc(targets: list[str], forced: set[str] | None) -> dict[str, frozenset
         }
 
 
-def _try_writing(folder: Path) -> None:
-    """Raise MachineTrouble where DVC could not keep what stages make: they would run for nothing."""
+def _check_writable(folder: Path) -> None:
+    """Raise MachineTrouble if DVC could not store the outputs of stages."""
     with told_in_words():
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=folder) as stream:
-            stream.write(bytes(_ROOM))
+            stream.write(bytes(_PROBE_BYTES))
             stream.flush()
 
 
 def run_all(upstream: Upstream, pool: ThreadPoolExecutor, jobs: int, run_stage: RunStage, run: Run) -> None:
-    """Run every stage once those it waits for are done; first the one with the longest way to the end behind it."""
+    """Run each stage when its inputs are ready, those with the longest remaining chain first."""
     remaining = _remaining_seconds(upstream, read_durations())
     waiting = dict(upstream)
     running: dict[Future[int], str] = {}
@@ -164,21 +175,21 @@ def run_all(upstream: Upstream, pool: ThreadPoolExecutor, jobs: int, run_stage: 
         for future in wait(running, return_when=FIRST_COMPLETED).done:
             name = running.pop(future)
             if future.result():
-                waiting = _without_followers(waiting, name)
-            _tell(name, run, len(upstream))
+                waiting = _without_dependents(waiting, name)
+            _report_stage(name, run, len(upstream))
 
 
 def describe_run(run: Run) -> str:
-    """Where the time went, by kind of stage, and which stages failed."""
+    """The time per kind of stage, and the failed stages with their logs."""
     kinds: dict[str, list[float]] = {}
     for name, seconds in run.seconds.items():
         kinds.setdefault(name.split(":")[-1].split("@")[0], []).append(seconds)
-    rows = sorted(kinds.items(), key=lambda row: -sum(row[1]))
-    lines = [f"{kind:16} {len(seconds):4} stages {sum(seconds):8.1f} s" for kind, seconds in rows]
+    by_time = sorted(kinds.items(), key=lambda entry: -sum(entry[1]))
+    lines = [f"{kind:16} {len(seconds):4} stages {sum(seconds):8.1f} s" for kind, seconds in by_time]
     lines.append(
-        f"{'all':16} {len(run.seconds):4} stages {sum(run.seconds.values()):8.1f} s, in {run.wall:.1f} s by the clock"
+        f"{'all':16} {len(run.seconds):4} stages {sum(run.seconds.values()):8.1f} s, in {run.wall:.1f} s wall time"
     )
-    lines += [f"failed: {name}; all it said: {log_of(name)}" for name in run.failed]
+    lines += [f"failed: {name}; full output: {log_of(name)}" for name in run.failed]
     return "\n".join(lines)
 
 
@@ -191,34 +202,34 @@ def _timed(name: str, run_stage: RunStage, run: Run) -> int:
     return code
 
 
-def _tell(name: str, run: Run, number: int) -> None:
-    """One line per finished stage, and what a failed one said last."""
+def _report_stage(name: str, run: Run, total: int) -> None:
+    """Print one line per finished stage, and the last lines of output of a failed one."""
     done = len(run.seconds) - 1
-    print(f"[{done}/{number}] {name}: {'FAILED after ' * (name in run.failed)}{run.seconds[name]:.1f} s", flush=True)
+    print(f"[{done}/{total}] {name}: {'FAILED after ' * (name in run.failed)}{run.seconds[name]:.1f} s", flush=True)
     if name in run.failed:
         lines = log_of(name).read_text(errors="replace").splitlines()[-TAIL:] if log_of(name).is_file() else []
         print("\n".join(f"    {line}" for line in lines), file=sys.stderr, flush=True)
 
 
-def _without_followers(waiting: Upstream, failed: str) -> dict[str, frozenset[str]]:
-    """The stages that do not wait, directly or through others, for the one that failed."""
-    lost = {failed}
-    while more := {name for name, needs in waiting.items() if name not in lost and needs & lost}:
-        lost |= more
-    return {name: needs for name, needs in waiting.items() if name not in lost}
+def _without_dependents(waiting: Upstream, failed: str) -> dict[str, frozenset[str]]:
+    """The stages that do not depend, directly or indirectly, on the failed one."""
+    blocked = {failed}
+    while more := {name for name, needs in waiting.items() if name not in blocked and needs & blocked}:
+        blocked |= more
+    return {name: needs for name, needs in waiting.items() if name not in blocked}
 
 
-def _remaining_seconds(upstream: Upstream, known: Mapping[str, float]) -> dict[str, float]:
-    """For each stage the seconds of the longest chain that starts with it; 1 where nothing is known."""
-    followers: dict[str, list[str]] = {name: [] for name in upstream}
+def _remaining_seconds(upstream: Upstream, durations: Mapping[str, float]) -> dict[str, float]:
+    """Per stage, the seconds of the longest chain that starts with it; 1 per stage without a known duration."""
+    dependents: dict[str, list[str]] = {name: [] for name in upstream}
     for name, needs in upstream.items():
         for need in needs:
-            followers[need].append(name)
+            dependents[need].append(name)
     seconds: dict[str, float] = {}
 
     def fill(name: str) -> float:
         if name not in seconds:
-            seconds[name] = known.get(name, 1.0) + max(map(fill, followers[name]), default=0.0)
+            seconds[name] = durations.get(name, 1.0) + max(map(fill, dependents[name]), default=0.0)
         return seconds[name]
 
     for name in upstream:
@@ -227,15 +238,15 @@ def _remaining_seconds(upstream: Upstream, known: Mapping[str, float]) -> dict[s
 
 
 def read_durations() -> dict[str, float]:
-    """Seconds of every stage when it last ran; nothing where that is not known."""
+    """The seconds of the last run of each stage; empty without a record."""
     try:
         return {str(name): float(value) for name, value in json.loads(DURATIONS.read_text()).items()}
     except (OSError, ValueError, TypeError, AttributeError):
-        return {}  # only the order of stages depends on it
+        return {}  # durations only affect the order of stages
 
 
 def log_of(name: str) -> Path:
-    """Where what a stage printed is kept."""
+    """The log file of a stage."""
     return LOGS / f"{name.replace('/', '-').replace(':', '-')}.log"
 
 
@@ -244,7 +255,10 @@ def _cores() -> int:
 
 
 class _Children:
-    """Processes that run DVC for one stage each, forked from one that has it loaded; none outlives this one's end."""
+    """Child processes that run DVC for one stage each, forked from a process that has imported DVC.
+
+    No child outlives the ``with`` block.
+    """
 
     def __init__(self, cores: int) -> None:
         self.cores, self.ends = cores, False
@@ -261,11 +275,11 @@ class _Children:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop what is still at work, as after Ctrl-C: the outputs of unfinished stages stay what they were.
+        """Stop running stages as Ctrl-C does: outputs of unfinished stages do not change.
 
         A stage that has not ended after STOP_S is killed.
         """
-        with _STARTING:
+        with _START_LOCK:
             self.ends = True
         for number, seconds in ((signal.SIGINT, STOP_S), (signal.SIGKILL, 0)):
             for process in self._at_work(0):
@@ -274,9 +288,9 @@ class _Children:
         self.warm.close()
 
     def _at_work(self, seconds: float) -> list[Any]:
-        """The processes that have not ended, after up to so many seconds in which all of them might.
+        """The processes that are still running after waiting for up to ``seconds``.
 
-        Their exit codes are left to the threads that wait for them: a second reader would get none.
+        It does not read exit codes: the threads that wait for the processes need them, and only one reader gets them.
         """
         deadline, processes = time.monotonic() + seconds, list(self.processes)
         while processes:
@@ -287,7 +301,7 @@ class _Children:
         return processes
 
     def run(self, name: str) -> int:
-        """DVC's exit code for one stage; what it prints goes to the stage's log."""
+        """Run one stage and return DVC's exit code; its output goes to the log of the stage."""
         LOGS.mkdir(parents=True, exist_ok=True)
         environment = {"HOIDATA_JOBS": str(self.cores), **self.warm.environment}
         process = self.context.Process(
@@ -313,8 +327,8 @@ def _signal_group(leader: int, number: int) -> None:
 
 @contextmanager
 def _without_main() -> Iterator[None]:
-    """A child that starts meanwhile does not import what this process was started with: Prefect takes a second."""
-    with _STARTING:
+    """Within this block, new children do not import the main module of this process; Prefect's takes a second."""
+    with _START_LOCK:
         main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
         try:
             yield
@@ -323,7 +337,7 @@ def _without_main() -> Iterator[None]:
 
 
 def _run_single_stage(project: Path, name: str, force: bool, environment: dict[str, str]) -> None:
-    """In the child: its own group of processes, so that a signal for one stage reaches all of it."""
+    """Run one stage in the child, in a new process group, so that a signal reaches all processes of the stage."""
     from dvc.cli import main
 
     os.chdir(project)

@@ -1,1 +1,1 @@
-"""How good a motion is: figures of predicted clips beside the clips they were made for; the one list of metrics."""
+"""Metrics that compare predicted clips with the recorded clips, and the registry that lists them."""

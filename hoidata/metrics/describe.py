@@ -1,7 +1,7 @@
-"""The list of metrics as README.md beside this file: ``python -m hoidata.metrics.describe > .../README.md``."""
+"""Generates README.md of this folder: ``python -m hoidata.metrics.describe > hoidata/metrics/README.md``."""
 
-from hoidata.metrics.asked_metrics import ASKED_LISTS
 from hoidata.metrics.feature_metrics import FEATURE_METRICS, FeatureMetric
+from hoidata.metrics.optional_metrics import OPTIONAL_LISTS
 from hoidata.metrics.registry import METRICS, Metric
 
 _HEAD = """# Metrics
@@ -10,26 +10,27 @@ _HEAD = """# Metrics
 `hoidata.metrics.evaluate.evaluate_store` does it in Python ([example](../../docs/measure.md)). `python -m
 hoidata.metrics.describe` generates this page from `registry.py` and `feature_metrics.py`.
 
-To add a metric: a function of (pair, every) that returns the values of one motion as an array, or `Unmeasured` with
-the reason, and an entry in `METRICS`.
+To add a metric: a function of (pair, frame_step) that returns the values of one motion as an array, or `Unmeasured`
+with the reason, and an entry in `METRICS`. The entry is the only place that names its direction, unit and title.
 
-- *nearer the truth*: the value of the recorded clips (family `ground-truth`) is best.
+- *closer to recorded*: the value of the recorded clips (family `ground-truth`) is best.
+- *floor of*: a lower bound of another metric. It is not ranked.
 - *Hand frames*: frames in which the recorded clip has an active hand. *Lifted frames*: frames in which the object is
   more than 15 mm above the table, the 3rd percentile of the lowest vertex of the recorded clip. Interpolated frames
   are never used.
-- Values are means over motions unless a row says otherwise. *Best sample*: the best motion of each clip. `counts`
-  gives the number of clips, motions and values.
+- Values are means over motions unless the definition says otherwise. *Best sample*: the best motion of each clip.
+  `counts` gives the number of clips, motions and values.
 - A clip without a value is not counted as 0. `unmeasured` gives the reasons and the number of clips for each metric;
   tables and pages list a metric without any value as not measured.
 - Two 95 % intervals. `repetitions`: Student's t over repetitions of sampling. `clips`: bootstrap over source
   sequences. Neither covers training.
-- `asked.npz` next to the clips holds the requested contact maps. Without it adherence is not measured.
+- `asked.npz` next to the clips has the target contact maps. Without it adherence is not measured.
 - A store with `"length": "own"` has motions of estimated length. Metrics that compare frame by frame are not measured
   for it.
 
 """
 _COLUMNS = "| name | unit | better | definition | source |\n|---|---|---|---|---|\n"
-_ASKED = """
+_ON_REQUEST = """
 ## On request: `{}`
 
 `evaluate: {metrics: [{}]}` in `params.yaml`, or `hoidata evaluate ... --metrics {}`.
@@ -49,7 +50,8 @@ _SHORTER = {
     "frames in which the object is more than 15 mm above the table (3rd percentile of the true clip's lowest vertex)": (
         "lifted frames"
     ),
-    "the contact stage's distance and points (its info.json)": "the contact stage's threshold",
+    "distance and points of the contact stage (its info.json)": "threshold of the contact stage",
+    "in the true clip": "in the recorded clip",
     "of all clips of a repetition, mean over repetitions": "over all clips",
     "BimArt (Zhang et al. 2025), this project: corrected": "BimArt, corrected",
     "BimArt (Zhang et al. 2025)": "BimArt",
@@ -61,8 +63,10 @@ _SHORTER = {
 
 def readme() -> str:
     """The text of README.md."""
-    asked = ((_ASKED.replace("{}", name) + _COLUMNS, map(_cells, rows)) for name, rows in ASKED_LISTS.items())
-    tables = (_HEAD + _COLUMNS, map(_cells, METRICS)), *asked, (_FEATURES + _COLUMNS, _feature_rows())
+    optional = (
+        (_ON_REQUEST.replace("{}", name) + _COLUMNS, map(_cells, metrics)) for name, metrics in OPTIONAL_LISTS.items()
+    )
+    tables = (_HEAD + _COLUMNS, map(_cells, METRICS)), *optional, (_FEATURES + _COLUMNS, _feature_rows())
     return "".join(head + "".join(f"| {' | '.join(cells)} |\n" for cells in rows) for head, rows in tables)
 
 
@@ -70,15 +74,15 @@ def _cells(metric: Metric) -> tuple[str, ...]:
     reduction = {"mean over motions": "", "best of a clip's samples": "best sample"}.get(
         metric.reduction, metric.reduction
     )
-    every = f"every {metric.every}rd frame" if metric.every > 1 else ""
+    step = f"every {metric.frame_step}rd frame" if metric.frame_step > 1 else ""
     samples = f"first {metric.samples} sample(s)" if metric.samples else ""
     frames = "" if metric.frames == "all" else metric.frames
-    parts = (metric.title, frames, metric.thresholds, reduction, every, samples)
+    parts = (metric.title, frames, metric.thresholds, reduction, step, samples)
     return f"`{metric.name}`", metric.unit, _direction(metric), _joined(parts), _shorter(metric.source)
 
 
 def _feature_rows() -> list[tuple[str, ...]]:
-    """One row per feature metric; those that differ in the encoder alone share a row."""
+    """One table row per feature metric; metrics that differ only in the encoder share a row."""
     rows: dict[str, tuple[str, ...]] = {}
     names = {metric.name for metric in FEATURE_METRICS}
     for metric in FEATURE_METRICS:
@@ -86,8 +90,8 @@ def _feature_rows() -> list[tuple[str, ...]]:
         if metric.name != paper and paper in names:
             continue
         both = metric.name == paper and metric.name.replace("_paper", "_corrected") in names
-        row = _feature_cells(metric)
-        rows[metric.name] = tuple(cell.replace("_paper", "_paper\\|corrected") for cell in row) if both else row
+        cells = _feature_cells(metric)
+        rows[metric.name] = tuple(cell.replace("_paper", "_paper\\|corrected") for cell in cells) if both else cells
     return list(rows.values())
 
 

@@ -1,6 +1,6 @@
-"""Motions as an encoder sees them, and what is known of each: the ground of every figure that needs features.
+"""Encoded motions: the features of predicted and recorded motions that feature metrics compare.
 
-An encoder is handed in; nothing here knows a network. What it says of a motion depends on that motion alone.
+Encoders are injected; this package imports no model. The encoding of a motion depends on that motion alone.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,140 +16,142 @@ from hoidata.metrics.pair import Motion, acting_sides
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import Store
 
-MOTIONS_AT_ONCE = 128
+MOTIONS_PER_BATCH = 128
 UNKNOWN = -1
 
 
 class Encoding(NamedTuple):
-    """features: (motion, F) float64; logits: (motion, K), with K = 0 of an encoder that knows no labels."""
+    """The output of an encoder for a batch of motions."""
 
-    features: np.ndarray
-    logits: np.ndarray
+    features: np.ndarray  # (motion, F) float64
+    logits: np.ndarray  # (motion, K); K = 0 for an encoder without labels
 
 
 class Encoder(Protocol):
-    """Something learnt that turns motions into features.
-
-    name: as it stands in the names of figures. digest: SHA-256 of its weights and configuration. labels: the
-    verbs that its logits stand for, in their order; none of an encoder that tells no labels apart.
-    """
+    """A function from motions to features, learned or not."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """The suffix of the metrics that use this encoder."""
+        ...
+
     @property
-    def digest(self) -> str: ...
+    def digest(self) -> str:
+        """SHA-256 of weights and configuration."""
+        ...
+
     @property
-    def labels(self) -> tuple[str, ...]: ...
+    def labels(self) -> tuple[str, ...]:
+        """The verbs of the logits, in order; empty for an encoder that does not classify."""
+        ...
 
     def encode(self, motions: Sequence[Motion], sides: Sequence[tuple[Side, ...]]) -> Encoding:
-        """Features and logits of motions of which only the hands ``sides`` act; others' numbers count nothing."""
+        """Encode motions. ``sides`` are the acting hands of each; the other hands are ignored."""
         ...
 
     def encode_text(self, text: np.ndarray) -> np.ndarray | None:
-        """(clip, F) features of sentences (clip, 512) in the space of the motions; None of a classifier."""
+        """(clip, F) features of sentences (clip, 512) in the feature space of motions; None for a classifier."""
         ...
 
 
 @dataclass(frozen=True)
 class EncodedSet:
-    """Features of motions, one row each, with what is known of the clip each was made for.
+    """Encodings of M motions of one encoder, with facts of the clips they belong to."""
 
-    features (M, F), logits (M, K). label (M,): index into the encoder's labels, ``UNKNOWN`` for a verb it never met.
-    clip (M,): which clip, an index that is the same in sets that belong together. sample (M,): which of its motions.
-    prompt (M,): verb, object and hand in words, what tells sentences apart; object (M,): name of the object. group
-    (M,): source sequence of the clip. text (M, F): the clip's own sentence in the space of the motions, or None.
-    """
-
-    encoder: str
-    digest: str
-    labels: tuple[str, ...]
-    features: np.ndarray
-    logits: np.ndarray
-    label: np.ndarray
-    clip: np.ndarray
-    sample: np.ndarray
-    prompt: np.ndarray
-    object: np.ndarray
-    group: np.ndarray
-    text: np.ndarray | None = None
+    encoder: str  # name of the encoder
+    digest: str  # of the encoder
+    labels: tuple[str, ...]  # of the encoder
+    features: np.ndarray  # (M, F)
+    logits: np.ndarray  # (M, K)
+    label: np.ndarray  # (M,) index into ``labels``, ``UNKNOWN`` for a verb that was not trained
+    clip: np.ndarray  # (M,) index of the clip, shared by sets that are compared
+    sample: np.ndarray  # (M,) number of the motion among those of its clip
+    prompt: np.ndarray  # (M,) verb, object and hand in words: equal prompts count as the same sentence
+    object: np.ndarray  # (M,) name of the object
+    group: np.ndarray  # (M,) source sequence of the clip
+    text: np.ndarray | None = None  # (M, F) the clip's sentence in the feature space of motions
 
     def __len__(self) -> int:
         return len(self.features)
 
     def take(self, rows: np.ndarray) -> "EncodedSet":
-        """Some rows of it, in the order given."""
+        """The motions ``rows``, in that order."""
         arrays = {item.name: getattr(self, item.name) for item in fields(self)}
         return replace(self, **{name: array[rows] for name, array in arrays.items() if isinstance(array, np.ndarray)})
 
     def repetitions(self) -> list["EncodedSet"]:
-        """The first motion of every clip, the second of every clip, and so on: each is one run of the experiment."""
+        """One set per sample number: the first motions of all clips, the second motions, and so on."""
         return [self.take(np.flatnonzero(self.sample == number)) for number in np.unique(self.sample)]
 
 
-class Asked(NamedTuple):
-    """One motion to encode. sides: the hands that act. clip: index of its clip; sample: which of its motions."""
+class EncoderInput(NamedTuple):
+    """One motion to encode."""
 
     motion: Motion
-    sides: tuple[Side, ...]
-    clip: int
-    sample: int
+    sides: tuple[Side, ...]  # the acting hands
+    clip: int  # index of its clip
+    sample: int  # number among the motions of its clip
 
 
 def encode_sets(
-    encoders: Sequence[Encoder], asked: Iterable[Asked], annotated: AnnotatedStore, ids: Sequence[str]
+    encoders: Sequence[Encoder], inputs: Iterable[EncoderInput], annotated: AnnotatedStore, ids: Sequence[str]
 ) -> list[EncodedSet]:
-    """One :class:`EncodedSet` per encoder of the motions asked, a few of which are in memory at a time.
+    """Encode motions with every encoder, in batches; one set per encoder, none without motions.
 
-    ids: the clips that ``Asked.clip`` counts, of the dataset ``annotated``.
+    Args:
+        inputs: a stream of motions.
+        ids: the clips of the dataset ``annotated`` that ``EncoderInput.clip`` indexes.
     """
-    rows, found = list[tuple[int, int]](), [list[Encoding]() for _ in encoders]
-    stream = iter(asked)
-    while chunk := list(islice(stream, MOTIONS_AT_ONCE)):
-        rows += [(item.clip, item.sample) for item in chunk]
+    numbers: list[tuple[int, int]] = []
+    batches: list[list[Encoding]] = [[] for _ in encoders]
+    stream = iter(inputs)
+    while chunk := list(islice(stream, MOTIONS_PER_BATCH)):
+        numbers += [(item.clip, item.sample) for item in chunk]
         motions, sides = [item.motion for item in chunk], [item.sides for item in chunk]
-        for own, encoder in zip(found, encoders, strict=True):
-            own.append(encoder.encode(motions, sides))
-    clip, sample = np.array(rows, dtype=np.int64).reshape(-1, 2).T
+        for encodings, encoder in zip(batches, encoders, strict=True):
+            encodings.append(encoder.encode(motions, sides))
+    clip, sample = np.array(numbers, dtype=np.int64).reshape(-1, 2).T
     return [
-        _encoded(encoder, own, clip, sample, annotated, ids)
-        for encoder, own in zip(encoders, found, strict=True)
-        if own
+        _encoded(encoder, encodings, clip, sample, annotated, ids)
+        for encoder, encodings in zip(encoders, batches, strict=True)
+        if encodings
     ]
 
 
 def _encoded(
     encoder: Encoder,
-    parts: list[Encoding],
+    encodings: list[Encoding],
     clip: np.ndarray,
     sample: np.ndarray,
     annotated: AnnotatedStore,
     ids: Sequence[str],
 ) -> EncodedSet:
-    known = annotated.store.sequences.loc[list(ids)]
+    sequences = annotated.store.sequences.loc[list(ids)]
     verbs, hands = [verb_of(annotated, clip_id) for clip_id in ids], [annotated.hand_type(clip_id) for clip_id in ids]
-    prompt = [" | ".join(map(str, row)) for row in zip(verbs, known["object_words"], hands, strict=True)]
+    prompt = [" | ".join(map(str, words)) for words in zip(verbs, sequences["object_words"], hands, strict=True)]
     label = [encoder.labels.index(verb) if verb in encoder.labels else UNKNOWN for verb in verbs]
     text = encoder.encode_text(np.stack([annotated.text_embedding(clip_id)[0] for clip_id in ids]))
     return EncodedSet(
-        encoder.name,
-        encoder.digest,
-        encoder.labels,
-        np.concatenate([part.features for part in parts]),
-        np.concatenate([part.logits for part in parts]),
-        np.array(label)[clip],
-        clip,
-        sample,
-        np.array(prompt)[clip],
-        known["object"].to_numpy(str)[clip],
-        known["sequence"].to_numpy(str)[clip],
-        None if text is None else text[clip],
+        encoder=encoder.name,
+        digest=encoder.digest,
+        labels=encoder.labels,
+        features=np.concatenate([batch.features for batch in encodings]),
+        logits=np.concatenate([batch.logits for batch in encodings]),
+        label=np.array(label)[clip],
+        clip=clip,
+        sample=sample,
+        prompt=np.array(prompt)[clip],
+        object=sequences["object"].to_numpy(str)[clip],
+        group=sequences["sequence"].to_numpy(str)[clip],
+        text=None if text is None else text[clip],
     )
 
 
-def recorded(annotated: AnnotatedStore, ids: Sequence[str]) -> Iterator[Asked]:
-    """The recorded clips themselves, one motion each."""
+def recorded_motions(annotated: AnnotatedStore, ids: Sequence[str]) -> Iterator[EncoderInput]:
+    """The recorded clips as encoder inputs, one motion each."""
     for number, clip_id in enumerate(ids):
-        yield Asked(stored_motion(annotated.store, clip_id), acting_sides(annotated.hand_type(clip_id)), number, 0)
+        sides = acting_sides(annotated.hand_type(clip_id))
+        yield EncoderInput(stored_motion(annotated.store, clip_id), sides, number, 0)
 
 
 def stored_motion(store: Store, clip_id: str) -> Motion:

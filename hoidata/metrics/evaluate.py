@@ -1,12 +1,14 @@
-"""A predicted store beside an annotated one: every metric of the registry over the clips of one part of the split.
+"""Evaluation: compares a store of predicted clips with an annotated dataset by all metrics of the registry.
 
-A predicted clip is called ``<reference id>~<k>``, k = 0, 1, ... for several motions of one reference, or just by the
-reference's id: motion k of every clip is repetition k of the experiment. It lies in the reference's world and has its
-frames, or some of them in a row: those that its ``source_frames`` name. Where ``meta/info.json`` says ``"length":
-"own"``, the family chose how long every motion is; then nothing is compared frame by frame, hands are looked at where
-the prediction has them, and the length itself is measured. A store is all of one kind, so no row mixes the two. Beside
-the clips may lie the contact maps that were asked for (``hoidata.metrics.asked``). Predictions that cannot be compared
-are left out, counted and listed with the reason.
+A predicted clip is named ``<reference id>~<k>`` with k = 0, 1, ..., or just ``<reference id>``. Motion k of every clip
+belongs to repetition k of the experiment. A prediction is in the world frame of its reference. It has all frames of the
+reference or a contiguous part, identified by ``source_frames``.
+
+If ``meta/info.json`` has ``"length": "own"``, the family chose the length of every motion of the store. Then nothing is
+compared frame by frame, hands are measured where the prediction has them, and the length itself is measured.
+
+Target contact maps may be stored next to the clips (``hoidata.metrics.target_contact``). Predictions that cannot be
+compared are skipped, counted and listed with the reason.
 """
 
 from collections.abc import Sequence
@@ -23,12 +25,12 @@ from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
-from hoidata.metrics.asked import AskedDistances, read_asked, read_asked_distances
 from hoidata.metrics.encoded import Encoder, stored_motion
 from hoidata.metrics.feature_metrics import encoder_summary
 from hoidata.metrics.intervals import bootstrap_interval, t_interval
 from hoidata.metrics.pair import Motion, Pair, TrueContact, acting_sides
-from hoidata.metrics.registry import METRICS, Metric, reduced, sum_and_count, unmeasured
+from hoidata.metrics.registry import METRICS, Metric, count_unmeasured, sum_and_count, summarise
+from hoidata.metrics.target_contact import AskedDistances, read_asked, read_asked_distances
 from hoidata.metrics.unmeasured import CHOSEN_LENGTH, Values
 from hoidata.objects.model import ObjectModel
 from hoidata.physics.scene import object_scene
@@ -37,35 +39,35 @@ from hoidata.store.distances import DistanceEntries
 from hoidata.store.store import Store, open_store
 from hoidata.workers import in_workers
 
-SAME_MESH_M = 1e-5  # float32 of a metre, with room
+SAME_MESH_M = 1e-5  # above the float32 rounding of metres
 DIGITS = 6
-WORKERS_PAY_FROM = 1000  # motions: a worker takes longer to start than 200 of them take
+WORKERS_PAY_FROM = 1000  # motions: starting a worker process takes as long as measuring 200
 
 
-class Unlike(NamedTuple):
-    """A prediction or reference that was not measured, and why."""
+class SkippedPair(NamedTuple):
+    """A prediction or reference that was not measured, with the reason."""
 
     clip_id: str
     reason: str
 
 
 class Sample(NamedTuple):
-    """One motion that was measured: its number among those of the clip, and its values by metric."""
+    """The values of one measured motion."""
 
-    number: int
-    values: dict[str, Values]
+    number: int  # among the motions of the clip
+    values: dict[str, Values]  # by metric
 
 
-class Measured(NamedTuple):
-    """What was found of one clip. group: the source sequence it was cut from."""
+class ClipResult(NamedTuple):
+    """The measured motions of one clip."""
 
-    group: str
+    group: str  # the source sequence that the clip was cut from
     samples: list[Sample]
-    left_out: list[Unlike]
+    skipped: list[SkippedPair]
 
     def of(self, metric: Metric, number: int | None = None) -> list[Values]:
-        """The values of one metric, or the reason for none, per motion it looked at, or those of one number."""
-        chosen = [own.values for own in self.samples if number is None or own.number == number]
+        """The values of one metric per measured motion, or only of motion ``number``."""
+        chosen = [sample.values for sample in self.samples if number is None or sample.number == number]
         return [values[metric.name] for values in chosen if metric.name in values]
 
 
@@ -80,110 +82,141 @@ def evaluate_store(
     jobs: int = 1,
     progress: bool = False,
 ) -> dict[str, Any]:
-    """Figures of the store ``predicted`` against the annotated dataset ``reference``.
+    """Evaluate the store ``predicted`` against the annotated dataset ``reference``.
 
-    reference: a folder with clips, annotation, contact and splits (``load_annotated``). hands: as in ``open_store``, of
-    both. split: the part of the chosen split that is asked for. encoders: whose features are compared too. jobs: worker
-    processes, used from ``WORKERS_PAY_FROM`` motions on; they change no figure. progress: a bar on stderr.
-    Gives held_out_clips, motions, synthetic, length ("given" or "own"), figures (one number per metric that has any
-    value), intervals (95 %, over repetitions and over clips drawn by source sequence, where there are two or more),
-    counts (how many clips, motions and values went into each), unmeasured (of each metric without a value of some clip
-    that could be compared, how many such clips there are by reason), actions (where the limits of verbs come from) and
-    left_out (clip id and reason); with encoders also notes and evaluators (``encoder_summary``). Raises BadInput where
-    no clip of the two stores can be compared.
+    Args:
+        predicted: folder of the predicted clips.
+        reference: folder with clips, annotation, contact and splits (``load_annotated``).
+        hands: the hand model of both, as in ``open_store``.
+        split: the part of the chosen split whose clips are the references.
+        encoders: their features are compared too.
+        jobs: worker processes, used from ``WORKERS_PAY_FROM`` motions on; results do not depend on it.
+        progress: show a bar on stderr.
+
+    Returns:
+        The content of a metrics file:
+
+        - held_out_clips, motions: how many references and compared predictions
+        - synthetic: whether a reference is generated
+        - length: "given" or "own"
+        - figures: the value of every metric that has one
+        - intervals: 95 % intervals over repetitions and over clips (bootstrap of source sequences)
+        - counts: the number of clips, motions and values of each metric
+        - unmeasured: per metric, the number of compared clips without a value, by reason
+        - actions: where the limits of verbs come from
+        - left_out: clip id and reason of everything that could not be compared
+        - with encoders also notes and evaluators (``encoder_summary``)
+
+    Raises:
+        BadInput: no clip of the two stores can be compared.
     """
     annotated, store = load_annotated(reference, hands), open_store(predicted, hands)
-    asked = annotated.ids(split)
-    samples, left_out = matched(store.ids, asked)
-    maps = read_asked(predicted), read_asked_distances(predicted)
-    bench = _Bench(annotated, store, metrics, samples, *maps, training_actions(annotated))
+    clip_ids = annotated.ids(split)
+    samples, skipped = match_predictions(store.ids, clip_ids)
+    evaluator = _Evaluator(
+        annotated=annotated,
+        store=store,
+        metrics=metrics,
+        samples=samples,
+        target_contact=read_asked(predicted),
+        target_distances=read_asked_distances(predicted),
+        actions=training_actions(annotated),
+    )
     jobs = jobs if sum(map(len, samples.values())) >= WORKERS_PAY_FROM else 1
-    found = dict[str, Measured]()
+    result_by_id: dict[str, ClipResult] = {}
     with Progress(console=Console(stderr=True), disable=not progress) as bar:
-        for clip_id, own in bar.track(in_workers(bench.measure, asked, jobs), len(asked), description="evaluate"):
-            found[clip_id] = own
-    clips = [found[clip_id] for clip_id in asked]
-    left_out += [item for own in clips for item in own.left_out]
-    measured = [own for own in clips if own.samples]
+        results = in_workers(evaluator.measure, clip_ids, jobs)
+        for clip_id, result in bar.track(results, len(clip_ids), description="evaluate"):
+            result_by_id[clip_id] = result
+    clips = [result_by_id[clip_id] for clip_id in clip_ids]
+    skipped += [item for clip in clips for item in clip.skipped]
+    measured = [clip for clip in clips if clip.samples]
     if not measured:
         got = f"{len(store)} clips, none of which can be compared"
-        why = f"; {left_out[0].clip_id}: {left_out[0].reason}" if left_out else ""
-        remedy = "name them so, in the world and with the frames of their reference"
-        raise BadInput(predicted, f"clips named <id>~<k> after the {split} clips of {reference}", got + why, remedy)
+        reason = f"; {skipped[0].clip_id}: {skipped[0].reason}" if skipped else ""
+        remedy = "name predictions after their reference and store them in its world frame with its frames"
+        raise BadInput(predicted, f"clips named <id>~<k> after the {split} clips of {reference}", got + reason, remedy)
     summary = _summary(metrics, measured)
     if encoders:
-        left = {item.clip_id for item in left_out}
-        ids = ((clip_id, samples[clip_id]) for clip_id in asked if found[clip_id].samples)
-        kept = {clip_id: [(_number(own, clip_id), own) for own in row if own not in left] for clip_id, row in ids}
-        learnt = encoder_summary(encoders, annotated, store, kept)
-        summary = learnt | {name: summary[name] | learnt[name] for name in summary}
+        skipped_ids = {item.clip_id for item in skipped}
+        compared = {
+            clip_id: [(_number(sample, clip_id), sample) for sample in samples[clip_id] if sample not in skipped_ids]
+            for clip_id in clip_ids
+            if result_by_id[clip_id].samples
+        }
+        of_features = encoder_summary(encoders, annotated, store, compared)
+        summary = of_features | {name: summary[name] | of_features[name] for name in summary}
     return {
-        "held_out_clips": len(asked),
-        "motions": sum(len(own.samples) for own in measured),
-        "synthetic": bool(annotated.store.sequences.loc[asked, "synthetic"].any()),
-        "length": "own" if bench.own_length else "given",
+        "held_out_clips": len(clip_ids),
+        "motions": sum(len(clip.samples) for clip in measured),
+        "synthetic": bool(annotated.store.sequences.loc[clip_ids, "synthetic"].any()),
+        "length": "own" if evaluator.own_length else "given",
         **summary,
-        "actions": bench.actions.facts,
-        "left_out": [item._asdict() for item in left_out],
+        "actions": evaluator.actions.facts,
+        "left_out": [item._asdict() for item in skipped],
     }
 
 
-def _summary(metrics: Sequence[Metric], measured: list[Measured]) -> dict[str, dict[str, Any]]:
-    """figures, intervals and counts of the metrics that have any value; unmeasured: reasons of those that lack some."""
-    figures, intervals, counts = dict[str, float](), dict[str, dict[str, list[float]]](), dict[str, dict[str, int]]()
-    without = dict[str, dict[str, int]]()
+def _summary(metrics: Sequence[Metric], measured: list[ClipResult]) -> dict[str, dict[str, Any]]:
+    """The entries figures, intervals, counts and unmeasured of a metrics file, each by metric."""
+    summary: dict[str, dict[str, Any]] = {"figures": {}, "intervals": {}, "counts": {}, "unmeasured": {}}
     for metric in metrics:
-        if reasons := unmeasured(metric, [own.of(metric) for own in measured]):
-            without[metric.name] = reasons
-        figure = reduced(metric, [own.of(metric) for own in measured])
-        if figure is not None:
-            figures[metric.name] = round(figure.value, DIGITS)
-            counts[metric.name] = figure.counts
-            if spread := intervals_of(metric, measured):
-                intervals[metric.name] = spread
-    return {"figures": figures, "intervals": intervals, "counts": counts, "unmeasured": without}
+        values = [clip.of(metric) for clip in measured]
+        if reasons := count_unmeasured(metric, values):
+            summary["unmeasured"][metric.name] = reasons
+        result = summarise(metric, values)
+        if result is not None:
+            summary["figures"][metric.name] = round(result.value, DIGITS)
+            summary["counts"][metric.name] = result.counts
+            if intervals := intervals_of(metric, measured):
+                summary["intervals"][metric.name] = intervals
+    return summary
 
 
-def intervals_of(metric: Metric, measured: list[Measured]) -> dict[str, list[float]]:
-    """repetitions and clips: ends of the 95 % intervals of a figure; none where there are fewer than two to compare.
+def intervals_of(metric: Metric, measured: list[ClipResult]) -> dict[str, list[float]]:
+    """The 95 % intervals of a metric over ``repetitions`` and over ``clips``; an interval needs at least two.
 
-    The best of all repetitions has no spread over them.
+    The best of all repetitions has no interval over repetitions.
     """
-    numbers = sorted({own.number for clip in measured for own in clip.samples})
+    numbers = sorted({sample.number for clip in measured for sample in clip.samples})
     numbers = [] if metric.reduction == "best of a clip's samples" else numbers
-    repeated = [reduced(metric, [clip.of(metric, number) for clip in measured]) for number in numbers]
-    parts = [(sum_and_count(metric, clip.of(metric)), clip.group) for clip in measured]
-    known = [(part, group) for part, group in parts if part[1]]
-    found = {
-        "repetitions": t_interval([figure.value for figure in repeated if figure is not None]),
-        "clips": bootstrap_interval([part for part, _ in known], [group for _, group in known], _ratio),
+    repetitions = [summarise(metric, [clip.of(metric, number) for clip in measured]) for number in numbers]
+    terms = [(sum_and_count(metric, clip.of(metric)), clip.group) for clip in measured]
+    terms = [(term, group) for term, group in terms if term[1]]
+    intervals = {
+        "repetitions": t_interval([result.value for result in repetitions if result is not None]),
+        "clips": bootstrap_interval([term for term, _ in terms], [group for _, group in terms], _ratio),
     }
-    return {name: [round(end, DIGITS) for end in ends] for name, ends in found.items() if ends is not None}
+    return {name: [round(end, DIGITS) for end in ends] for name, ends in intervals.items() if ends is not None}
 
 
-def _ratio(parts: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(draw,) figures: sums over counts, parts (clip, 2), under weights (draw, clip)."""
-    total, count = (weights @ parts).T
+def _ratio(terms: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(resample,) weighted sums over weighted counts, of terms (clip, 2) under weights (resample, clip)."""
+    total, count = (weights @ terms).T
     return total / count
 
 
-def matched(predicted_ids: list[str], asked: list[str]) -> tuple[dict[str, list[str]], list[Unlike]]:
+def match_predictions(
+    predicted_ids: list[str], reference_ids: list[str]
+) -> tuple[dict[str, list[str]], list[SkippedPair]]:
     """Predicted ids of each reference in the order of their numbers, and predictions without a reference."""
-    known, samples, left_out = set(asked), dict[str, list[tuple[int, str]]](), list[Unlike]()
+    references = set(reference_ids)
+    samples: dict[str, list[tuple[int, str]]] = {}
+    skipped: list[SkippedPair] = []
     for predicted_id in predicted_ids:
         base, _, number = predicted_id.rpartition("~")
-        if predicted_id in known:
+        if predicted_id in references:
             samples.setdefault(predicted_id, []).append((0, predicted_id))
-        elif base in known and number.isdecimal():
+        elif base in references and number.isdecimal():
             samples.setdefault(base, []).append((int(number), predicted_id))
         else:
-            left_out.append(Unlike(predicted_id, "no clip of this part of the split is its reference"))
-    return {key: [own for _, own in sorted(rows)] for key, rows in samples.items()}, left_out
+            skipped.append(SkippedPair(predicted_id, "no clip of this part of the split is its reference"))
+    return {reference: [sample for _, sample in sorted(numbered)] for reference, numbered in samples.items()}, skipped
 
 
 @dataclass(frozen=True)
 class _Reference:
-    """A clip of the annotated dataset, before it is cut to the frames of a prediction."""
+    """A clip of the annotated dataset, not yet cut to the frames of a prediction."""
 
     motion: Motion
     sides: tuple[Side, ...]
@@ -201,71 +234,81 @@ class _Reference:
         touched = np.zeros(self.index.count, dtype=bool)
         near = self.entries.window(start, stop)
         touched[near.point[np.isin(near.side, [SIDES.index(side) for side in self.sides])]] = True
-        own = Motion(whole.clip.take(slice(start, stop)), joints, whole.hands)
-        return own, TrueContact(self.index, self.part, touched, self.threshold_m)
+        motion = Motion(whole.clip.take(slice(start, stop)), joints, whole.hands)
+        return motion, TrueContact(self.index, self.part, touched, self.threshold_m)
 
 
 @dataclass
-class _Bench:
-    """Both stores, and what is built once per object. samples: predicted ids by reference.
-
-    asked, asked_distances: maps by motion id.
-    """
+class _Evaluator:
+    """Measures all predictions of a reference clip."""
 
     annotated: AnnotatedStore
-    store: Store
+    store: Store  # of the predictions
     metrics: tuple[Metric, ...]
-    samples: dict[str, list[str]]
-    asked: dict[str, np.ndarray]
-    asked_distances: dict[str, AskedDistances]
+    samples: dict[str, list[str]]  # predicted ids by reference id
+    target_contact: dict[str, np.ndarray]  # by predicted id
+    target_distances: dict[str, AskedDistances]  # by predicted id
     actions: Actions
-    indices: dict[str, ProximityIndex] = field(default_factory=dict)
+    indices: dict[str, ProximityIndex] = field(default_factory=dict)  # cache by object
 
     @property
     def own_length(self) -> bool:
         return self.store.info.get("length") == "own"
 
-    def measure(self, clip_id: str) -> Measured:
-        """The values of every sample that can be compared, of the metrics that look at it; and the others."""
+    def measure(self, clip_id: str) -> ClipResult:
+        """The values of all predictions of one clip that can be compared, and the skipped ones."""
         group = str(self.annotated.store.sequences.at[clip_id, "sequence"])
         if clip_id not in self.samples:
-            return Measured(group, [], [Unlike(clip_id, "no prediction of this clip")])
-        reference, found, left_out, pairs = self._reference(clip_id), list[Sample](), list[Unlike](), list[Pair]()
+            return ClipResult(group, [], [SkippedPair(clip_id, "no prediction of this clip")])
+        reference = self._reference(clip_id)
+        measured: list[Sample] = []
+        skipped: list[SkippedPair] = []
+        pairs: list[Pair] = []
         together = [metric for metric in self.metrics if metric.together]
         for sample in self.samples[clip_id]:
             pair = self._pair(reference, sample)
             if isinstance(pair, str):
-                left_out.append(Unlike(sample, pair))
+                skipped.append(SkippedPair(sample, pair))
                 continue
-            looking = [
+            metrics = [
                 metric
                 for metric in self.metrics
-                if (metric.samples is None or len(found) < metric.samples) and not metric.together
+                if (metric.samples is None or len(measured) < metric.samples) and not metric.together
             ]
-            values = {metric.name: _values(metric, pair) for metric in looking}
-            found.append(Sample(_number(sample, clip_id), values))
-            pairs += [pair] if together else []  # a motion and its meshes are kept no longer than they are asked for
+            values = {metric.name: _values(metric, pair) for metric in metrics}
+            measured.append(Sample(_number(sample, clip_id), values))
+            pairs += [pair] if together else []  # pairs hold meshes: keep them only for metrics that need all samples
         for metric in together if pairs else ():
-            every_motion = CHOSEN_LENGTH if self.own_length else metric.measure(pairs, metric.every)
-            found[0].values[metric.name] = every_motion
-        return Measured(group, found, left_out)
+            measured[0].values[metric.name] = (
+                CHOSEN_LENGTH if self.own_length else metric.measure(pairs, metric.frame_step)
+            )
+        return ClipResult(group, measured, skipped)
 
     def _pair(self, reference: _Reference, sample: str) -> Pair | str:
-        """A prediction beside its reference, or why it cannot be compared."""
+        """A prediction and its reference, or why they cannot be compared."""
         predicted = stored_motion(self.store, sample)
-        asked, distances = self.asked.get(sample), self.asked_distances.get(sample)
-        check = own_window_of if self.own_length else window_of
-        window = check(predicted.clip, reference.motion.clip, reference.sides)
+        target, distances = self.target_contact.get(sample), self.target_distances.get(sample)
+        find_window = whole_window if self.own_length else window_of
+        window = find_window(predicted.clip, reference.motion.clip, reference.sides)
         if isinstance(window, str):
             return window
-        if asked is not None and asked.shape != reference.part.shape:
-            return f"the contact map asked for has {len(asked)} points, {len(reference.part)} expected"
-        if distances is not None and (why := _no_map_of(distances, predicted.clip)):
-            return why
-        own, contact = reference.cut(*window)
-        aligned = not self.own_length
-        given = aligned, asked, reference.verb, self.actions, distances
-        return Pair(predicted, own, reference.sides, contact, reference.table_m, *given)
+        if target is not None and target.shape != reference.part.shape:
+            return f"the target contact map has {len(target)} points, {len(reference.part)} expected"
+        if distances is not None and (mismatch := _map_mismatch(distances, predicted.clip)):
+            return mismatch
+        motion, contact = reference.cut(*window)
+        return Pair(
+            predicted=predicted,
+            reference=motion,
+            sides=reference.sides,
+            contact=contact,
+            table_m=reference.table_m,
+            aligned=not self.own_length,
+            target_contact=target,
+            verb=reference.verb,
+            actions=self.actions,
+            target_distances=distances,
+        )
 
     def _reference(self, clip_id: str) -> _Reference:
         annotated, motion = self.annotated, stored_motion(self.annotated.store, clip_id)
@@ -274,49 +317,49 @@ class _Bench:
         if name not in self.indices:
             self.indices[name] = ProximityIndex(points)
         return _Reference(
-            motion,
-            acting_sides(annotated.hand_type(clip_id)),
-            annotated.distances(clip_id),
-            self.indices[name],
-            points.part,
-            annotated.contact_threshold_m,
-            None if motion.clip.gravity is None else object_scene(motion.clip).table_height_m,
-            verb_of(annotated, clip_id),
+            motion=motion,
+            sides=acting_sides(annotated.hand_type(clip_id)),
+            entries=annotated.distances(clip_id),
+            index=self.indices[name],
+            part=points.part,
+            threshold_m=annotated.contact_threshold_m,
+            table_m=None if motion.clip.gravity is None else object_scene(motion.clip).table_height_m,
+            verb=verb_of(annotated, clip_id),
         )
 
 
 def _values(metric: Metric, pair: Pair) -> Values:
-    return CHOSEN_LENGTH if metric.aligned and not pair.aligned else metric.measure(pair, metric.every)
+    return CHOSEN_LENGTH if metric.aligned and not pair.aligned else metric.measure(pair, metric.frame_step)
 
 
-def _no_map_of(distances: AskedDistances, clip: Clip) -> str:
-    """Why a map of distances is not one of this clip; nothing where it is."""
+def _map_mismatch(distances: AskedDistances, clip: Clip) -> str:
+    """Why a target distance map does not belong to this clip; "" if it does."""
     count = len(distances.distance_m)
-    return "" if count == clip.n_frames else f"the map of distances asked for has {count} frames, not {clip.n_frames}"
+    return "" if count == clip.n_frames else f"the target distance map has {count} frames, not {clip.n_frames}"
 
 
 def _number(sample: str, clip_id: str) -> int:
-    """Of a predicted clip: k of ``<reference id>~<k>``, 0 for the bare id."""
+    """The k of a predicted id ``<reference id>~<k>``, 0 for the bare id."""
     return int(sample.removeprefix(clip_id).lstrip("~") or 0)
 
 
-def own_window_of(predicted: Clip, reference: Clip, sides: tuple[Side, ...]) -> tuple[int, int] | str:
-    """All frames of the reference, for a prediction of a length its family chose; or why it cannot be compared."""
-    if why := _other_object(predicted, reference):
-        return why
+def whole_window(predicted: Clip, reference: Clip, sides: tuple[Side, ...]) -> tuple[int, int] | str:
+    """All frames of the reference, for a prediction of estimated length; or why they cannot be compared."""
+    if mismatch := _object_mismatch(predicted, reference):
+        return mismatch
     absent = [side for side in sides if not predicted.hands[side].valid.any()]
     return f"the {absent[0]} hand acts and is never valid" if absent else (0, reference.n_frames)
 
 
 def window_of(predicted: Clip, reference: Clip, sides: tuple[Side, ...]) -> tuple[int, int] | str:
-    """First and one past the last frame of the reference that a prediction is of; or why it cannot be compared."""
-    if why := _other_object(predicted, reference):
-        return why
+    """The frames [start, stop) of the reference that a prediction covers; or why they cannot be compared."""
+    if mismatch := _object_mismatch(predicted, reference):
+        return mismatch
     start = 0
     if predicted.n_frames != reference.n_frames:
-        start = _start_of(predicted.source_frames, reference.source_frames)
+        start = _start_in(predicted.source_frames, reference.source_frames)
     if start < 0:
-        expected = f"{reference.n_frames} expected, or source_frames that stand in a row in the reference's"
+        expected = f"{reference.n_frames} expected, or source_frames that are a contiguous part of the reference's"
         return f"{predicted.n_frames} frames, {expected}"
     window = start, start + predicted.n_frames
     for side in sides:
@@ -325,14 +368,17 @@ def window_of(predicted: Clip, reference: Clip, sides: tuple[Side, ...]) -> tupl
     return window
 
 
-def _other_object(predicted: Clip, reference: Clip) -> str:
+def _object_mismatch(predicted: Clip, reference: Clip) -> str:
     name = predicted.object.model.name
-    same = _is_same(predicted.object.model, reference.object.model)
+    same = _is_same_mesh(predicted.object.model, reference.object.model)
     return "" if same else f"its object {name!r} has another mesh, parts or hinge than the reference's"
 
 
-def _start_of(part: np.ndarray, whole: np.ndarray) -> int:
-    """Where ``part (n,)`` stands in a row in ``whole (m,)``, 0 where it counts from 0 itself; -1 elsewhere."""
+def _start_in(part: np.ndarray, whole: np.ndarray) -> int:
+    """The index at which ``whole (m,)`` contains ``part (n,)`` contiguously; -1 if it does not.
+
+    A part numbered from 0 on, in a recording without these numbers, starts at 0.
+    """
     if len(part) < len(whole) and np.array_equal(part, np.arange(len(part))) and part[-1] not in whole:
         return 0
     for start in np.flatnonzero(whole == part[0]):
@@ -341,7 +387,7 @@ def _start_of(part: np.ndarray, whole: np.ndarray) -> int:
     return -1
 
 
-def _is_same(one: ObjectModel, other: ObjectModel) -> bool:
+def _is_same_mesh(one: ObjectModel, other: ObjectModel) -> bool:
     if one.faces.shape != other.faces.shape or one.vertices_m.shape != other.vertices_m.shape:
         return False
     if (one.hinge is None) != (other.hinge is None):

@@ -1,7 +1,7 @@
-"""What can be said of encoded motions; each function gives one figure of a ``Comparison``, or why there is none.
+"""Feature metrics: accuracy, FID, KID, diversity, R-precision. Each function maps a ``Comparison`` to one result.
 
-Every figure is computed per repetition (the first motion of every clip, the second, ...) and is their mean;
-"released" is how IMoS's code does it.
+Metrics are computed per repetition (the first motion of every clip, the second, ...) and averaged. "Released" follows
+the code of IMoS.
 """
 
 from collections.abc import Callable
@@ -14,19 +14,19 @@ from hoidata.metrics.encoded import UNKNOWN, EncodedSet
 from hoidata.metrics.feature_sets import (
     TOO_SMALL,
     Comparison,
-    FeatureFigure,
+    FeatureResult,
     cubic_kernel,
-    enough_rows,
     euclidean,
     fid_paired,
     frechet_distance,
     gaussian,
-    mean_figure,
+    has_enough_rows,
     mean_matrix,
     mean_of_pairs,
+    mean_result,
     mean_with_itself,
-    rows_of,
-    set_figure,
+    rows_of_clips,
+    set_result,
 )
 from hoidata.metrics.intervals import bootstrap_interval, t_interval
 from hoidata.metrics.unmeasured import Unmeasured
@@ -34,158 +34,175 @@ from hoidata.metrics.unmeasured import Unmeasured
 SEED = 0
 GROUP = 32  # sentences to choose from in R-precision
 HALVES = 10
-FRECHET_DRAWS = 200
+FRECHET_RESAMPLES = 200
 RELEASED_PAIRS, RELEASED_PAIRS_OF_LABEL = 200, 20
 MEMORISED_BELOW = 0.5
 NO_OTHERS = {False: "there is no other sentence", True: "there is no other sentence about the same object"}
-Found = FeatureFigure | Unmeasured
-Measure = Callable[[Comparison], Found]
+Outcome = FeatureResult | Unmeasured
+Measure = Callable[[Comparison], Outcome]
 NO_TRAINING = Unmeasured("there are no training clips")
 
 
 def is_top(encoded: EncodedSet, k: int) -> np.ndarray:
-    """(motion,) 1 where the true label is among the k highest logits, else 0; NaN for a label that was never learnt."""
-    known = encoded.label != UNKNOWN
-    own = encoded.logits[np.arange(len(encoded)), np.where(known, encoded.label, 0)]
-    higher = (encoded.logits >= own[:, None]).sum(axis=1) - 1  # a tie is a miss: equal logits know nothing
-    return np.where(known, higher < k, np.nan)
+    """(motion,) 1 if the true label is among the k highest logits, else 0; NaN for a label that was not trained."""
+    has_label = encoded.label != UNKNOWN
+    true_logit = encoded.logits[np.arange(len(encoded)), np.where(has_label, encoded.label, 0)]
+    higher = (encoded.logits >= true_logit[:, None]).sum(axis=1) - 1  # a tie is a miss: equal logits carry no evidence
+    return np.where(has_label, higher < k, np.nan)
 
 
 def accuracy(k: int) -> Measure:
+    """Top-k classification accuracy."""
     without = "the verb is in no training clip"
-    return lambda comparison: mean_figure(comparison, is_top(comparison.predicted, k), without=without)
+    return lambda comparison: mean_result(comparison, is_top(comparison.predicted, k), without=without)
 
 
 def confusion(encoded: EncodedSet) -> np.ndarray:
-    """(label, predicted label) how many motions; labels that were never learnt are left out."""
+    """(label, predicted label) number of motions; labels that were not trained are skipped."""
     size = len(encoded.labels)
-    known = encoded.label != UNKNOWN
-    pairs = encoded.label[known] * size + encoded.logits[known].argmax(axis=1)
+    has_label = encoded.label != UNKNOWN
+    pairs = encoded.label[has_label] * size + encoded.logits[has_label].argmax(axis=1)
     return np.bincount(pairs, minlength=size * size).reshape(size, size)
 
 
-def paired(comparison: Comparison) -> Found:
-    own = comparison.reference.features[comparison.own_reference]
-    return mean_figure(comparison, fid_paired(own, comparison.predicted.features))
+def paired(comparison: Comparison) -> Outcome:
+    """``fid_paired`` of every prediction and its recorded clip."""
+    reference_features = comparison.reference.features[comparison.reference_rows]
+    return mean_result(comparison, fid_paired(reference_features, comparison.predicted.features))
 
 
-def frechet(comparison: Comparison) -> Found:
-    """Against the recorded clips of the same part."""
-    return _frechet(comparison, comparison.reference, drawn_alike=True)
+def frechet(comparison: Comparison) -> Outcome:
+    """Frechet distance from the recorded reference clips."""
+    return _frechet(comparison, comparison.reference, same_clips=True)
 
 
-def frechet_train(comparison: Comparison) -> Found:
-    """Against the training clips, of which there are more."""
-    return NO_TRAINING if comparison.train is None else _frechet(comparison, comparison.train, drawn_alike=False)
+def frechet_train(comparison: Comparison) -> Outcome:
+    """Frechet distance from the training clips, which are more numerous."""
+    return NO_TRAINING if comparison.train is None else _frechet(comparison, comparison.train, same_clips=False)
 
 
-def _frechet(comparison: Comparison, other: EncodedSet, drawn_alike: bool) -> Found:
-    """drawn_alike: whether ``other`` holds the same clips, drawn again with the predicted ones."""
+def _frechet(comparison: Comparison, other: EncodedSet, same_clips: bool) -> Outcome:
+    """Frechet distance of the predictions from ``other``.
+
+    Args:
+        same_clips: ``other`` has the same clips as the predictions, so the bootstrap resamples both together.
+    """
     sets = comparison.repetitions
-    if not all(enough_rows(run.features) for run in sets):
+    if not all(has_enough_rows(run.features) for run in sets):
         sets = [comparison.predicted]
     counts = (len(comparison.clips), len(comparison.predicted), len(sets))
-    if not (enough_rows(sets[0].features) and enough_rows(other.features)):
-        return FeatureFigure(None, *counts, note=TOO_SMALL)
+    if not (has_enough_rows(sets[0].features) and has_enough_rows(other.features)):
+        return FeatureResult(None, *counts, note=TOO_SMALL)
     runs = [frechet_distance(*gaussian(run.features), *gaussian(other.features)) for run in sets]
     value, first = float(np.mean(runs)), sets[0]
-    own = np.searchsorted(comparison.clips, first.clip)
-    whole = gaussian(other.features)
-    also = rows_of(comparison.clips, other) if drawn_alike else None
+    clip_rows = np.searchsorted(comparison.clips, first.clip)
+    whole_gaussian = gaussian(other.features)
+    other_rows = rows_of_clips(comparison.clips, other) if same_clips else None
 
-    def again(_: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        rivals = (gaussian(other.features[also], row) if also is not None else whole for row in weights)
-        pairs = zip(weights, rivals, strict=True)
-        return np.array([frechet_distance(*gaussian(first.features, row[own]), *rival) for row, rival in pairs])
+    def one_resample(weights: np.ndarray) -> float:
+        target = whole_gaussian if other_rows is None else gaussian(other.features[other_rows], weights)
+        return frechet_distance(*gaussian(first.features, weights[clip_rows]), *target)
 
-    drawn = bootstrap_interval(comparison.clips, comparison.groups, again, FRECHET_DRAWS, about=value)
-    drawn = drawn and drawn._replace(low=max(drawn.low, 0.0))
+    def statistic(_: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        return np.array([one_resample(clip_weights) for clip_weights in weights])
+
+    interval = bootstrap_interval(comparison.clips, comparison.groups, statistic, FRECHET_RESAMPLES, centre=value)
+    interval = interval and interval._replace(low=max(interval.low, 0.0))
     note = "" if len(sets) > 1 or len(comparison.repetitions) == 1 else "all repetitions together"
-    return FeatureFigure(value, *counts, t_interval(runs), drawn, note)
+    return FeatureResult(value, *counts, repetitions=t_interval(runs), bootstrap=interval, note=note)
 
 
-def floor_halves(reference: EncodedSet, distance: Callable[[np.ndarray, np.ndarray], float | None]) -> float | None:
-    """Mean distance of one half of the recorded clips from the other, whole sequences together, over some divisions."""
+def distance_of_halves(
+    reference: EncodedSet, distance: Callable[[np.ndarray, np.ndarray], float | None]
+) -> float | None:
+    """Mean distance between two random halves of the recorded clips, over ``HALVES`` divisions.
+
+    A source sequence is never split. None if any division is too small.
+    """
     names, group = np.unique(reference.group, return_inverse=True)
-    found = []
+    distances = []
     for number in range(HALVES):
-        first = np.random.default_rng([SEED, number]).permutation(len(names))[: len(names) // 2]
-        inside = np.isin(group, first)
-        found.append(distance(reference.features[inside], reference.features[~inside]))
-    known = [value for value in found if value is not None and np.isfinite(value)]
-    return float(np.mean(known)) if len(known) == HALVES else None
+        first_groups = np.random.default_rng([SEED, number]).permutation(len(names))[: len(names) // 2]
+        is_first = np.isin(group, first_groups)
+        distances.append(distance(reference.features[is_first], reference.features[~is_first]))
+    finite = [value for value in distances if value is not None and np.isfinite(value)]
+    return float(np.mean(finite)) if len(finite) == HALVES else None
 
 
-def floor(distance: Callable[[np.ndarray, np.ndarray], float | None]) -> Measure:
-    """What a distance gives between halves of the truth itself."""
+def lower_bound(distance: Callable[[np.ndarray, np.ndarray], float | None]) -> Measure:
+    """The distance between halves of the recorded clips: no generator can be expected to score lower."""
 
-    def measure(comparison: Comparison) -> FeatureFigure:
-        value, size = floor_halves(comparison.reference, distance), len(comparison.reference)
-        return FeatureFigure(value, size, size, HALVES, note=TOO_SMALL if value is None else "")
+    def measure(comparison: Comparison) -> FeatureResult:
+        value, size = distance_of_halves(comparison.reference, distance), len(comparison.reference)
+        note = TOO_SMALL if value is None else ""
+        return FeatureResult(value, clips=size, motions=size, values=HALVES, note=note)
 
     return measure
 
 
-def kernel_distance(comparison: Comparison) -> Found:
-    """Over pairs of different clips alone, as each prediction belongs to one recorded clip (Gretton et al. 2012)."""
-    true = comparison.reference.features[rows_of(comparison.clips, comparison.reference)]
+def kernel_distance(comparison: Comparison) -> Outcome:
+    """Kernel distance over pairs of different clips: predictions and references are paired (Gretton et al. 2012)."""
+    recorded_features = comparison.reference.features[rows_of_clips(comparison.clips, comparison.reference)]
 
     def pairs(run: EncodedSet) -> np.ndarray:
-        own = true[np.searchsorted(comparison.clips, run.clip)]
-        across = cubic_kernel(run.features, own)
-        return cubic_kernel(run.features, run.features) + cubic_kernel(own, own) - across - across.T
+        recorded = recorded_features[np.searchsorted(comparison.clips, run.clip)]
+        across = cubic_kernel(run.features, recorded)
+        return cubic_kernel(run.features, run.features) + cubic_kernel(recorded, recorded) - across - across.T
 
     runs = [mean_of_pairs(pairs(run), np.ones((1, len(run))))[0] for run in comparison.repetitions]
-    return set_figure(comparison, runs, mean_matrix(comparison, pairs), mean_of_pairs)
+    return set_result(comparison, runs, mean_matrix(comparison, pairs), mean_of_pairs)
 
 
-def diversity(comparison: Comparison) -> Found:
+def diversity(comparison: Comparison) -> Outcome:
     """Mean distance over all pairs of clips."""
     ones = lambda run: np.ones((1, len(run)))  # noqa: E731
-    apart = lambda run: euclidean(run.features, run.features)  # noqa: E731
-    runs = [mean_of_pairs(apart(run), ones(run))[0] for run in comparison.repetitions]
-    return set_figure(comparison, runs, mean_matrix(comparison, apart), mean_of_pairs)
+    pairwise = lambda run: euclidean(run.features, run.features)  # noqa: E731
+    runs = [mean_of_pairs(pairwise(run), ones(run))[0] for run in comparison.repetitions]
+    return set_result(comparison, runs, mean_matrix(comparison, pairwise), mean_of_pairs)
 
 
-def diversity_released(comparison: Comparison) -> Found:
-    """200 pairs drawn with replacement, in which a clip may meet itself."""
+def diversity_released(comparison: Comparison) -> Outcome:
+    """Mean distance of 200 pairs sampled with replacement; a clip may be paired with itself."""
     runs = []
     for number, run in enumerate(comparison.repetitions):
         one, other = np.random.default_rng([SEED, number]).integers(0, len(run), (2, RELEASED_PAIRS))
         runs.append(np.linalg.norm(run.features[one] - run.features[other], axis=1).mean())
     matrix = mean_matrix(comparison, lambda run: euclidean(run.features, run.features))
-    return set_figure(comparison, runs, matrix, mean_with_itself)
+    return set_result(comparison, runs, matrix, mean_with_itself)
 
 
-def mean_within_labels(apart: np.ndarray, label: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(draw,) mean over labels of the mean distance within each; labels of one clip are left out."""
+def mean_within_labels(distances: np.ndarray, label: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(resample,) mean over labels of the mean distance within each label; labels of one clip are skipped."""
     members = [np.flatnonzero(label == one) for one in np.unique(label[label != UNKNOWN])]
-    means = [mean_of_pairs(apart[np.ix_(own, own)], weights[:, own]) for own in members if len(own) > 1]
+    means = [mean_of_pairs(distances[np.ix_(rows, rows)], weights[:, rows]) for rows in members if len(rows) > 1]
     if not means:
         return np.full(len(weights), np.nan)
     stacked = np.stack(means)
-    there = np.isfinite(stacked)
+    is_defined = np.isfinite(stacked)
     return np.divide(
-        np.where(there, stacked, 0).sum(axis=0),
-        there.sum(axis=0),
+        np.where(is_defined, stacked, 0).sum(axis=0),
+        is_defined.sum(axis=0),
         out=np.full(len(weights), np.nan),
-        where=there.any(axis=0),
+        where=is_defined.any(axis=0),
     )
 
 
-def multimodality_by_label(comparison: Comparison) -> Found:
+def multimodality_by_label(comparison: Comparison) -> Outcome:
     """Mean distance within a true label, over labels of at least two clips."""
-    label = comparison.reference.label[rows_of(comparison.clips, comparison.reference)]
-    apart = lambda run: euclidean(run.features, run.features)  # noqa: E731
-    runs = [mean_within_labels(apart(run), run.label, np.ones((1, len(run))))[0] for run in comparison.repetitions]
+    label = comparison.reference.label[rows_of_clips(comparison.clips, comparison.reference)]
+    pairwise = lambda run: euclidean(run.features, run.features)  # noqa: E731
+    runs = [mean_within_labels(pairwise(run), run.label, np.ones((1, len(run))))[0] for run in comparison.repetitions]
     single = int((np.unique(label[label != UNKNOWN], return_counts=True)[1] == 1).sum())
     note = f"{single} label{'s' * (single > 1)} of one clip left out" if single else ""
-    again = lambda matrix, weights: mean_within_labels(matrix, label, weights)  # noqa: E731
-    return set_figure(comparison, runs, mean_matrix(comparison, apart), again, note, "no label has two clips")
+    statistic = lambda matrix, weights: mean_within_labels(matrix, label, weights)  # noqa: E731
+    return set_result(comparison, runs, mean_matrix(comparison, pairwise), statistic, note, "no label has two clips")
 
 
-def multimodality_released(comparison: Comparison) -> Found:
-    """20 pairs per predicted label, drawn with replacement; a clip may meet itself, absent labels count as 0."""
+def multimodality_released(comparison: Comparison) -> Outcome:
+    """Mean distance of 20 pairs per predicted label, sampled with replacement.
+
+    A clip may be paired with itself, and labels that are never predicted count as 0.
+    """
     runs = []
     for number, run in enumerate(comparison.repetitions):
         random, guess = np.random.default_rng([SEED, number]), run.logits.argmax(axis=1)
@@ -197,99 +214,109 @@ def multimodality_released(comparison: Comparison) -> Found:
     if not runs:
         return Unmeasured("there are no motions")
     counts = (len(comparison.clips), len(comparison.predicted), len(runs))
-    return FeatureFigure(float(np.mean(runs)), *counts, t_interval(runs), note="no interval over clips")
+    return FeatureResult(float(np.mean(runs)), *counts, t_interval(runs), note="no interval over clips")
 
 
-def multimodality_by_prompt(comparison: Comparison) -> Found:
-    """Mean distance of the motions made for one prompt; none where every clip has one motion."""
+def multimodality_by_prompt(comparison: Comparison) -> Outcome:
+    """Mean distance of the motions generated for one prompt; unmeasured if every clip has one motion."""
     predicted, values = comparison.predicted, np.full(len(comparison.predicted), np.nan)
     for clip in comparison.clips:
         rows = np.flatnonzero(predicted.clip == clip)
         if len(rows) > 1:
             features = predicted.features[rows]
             values[rows] = mean_of_pairs(euclidean(features, features), np.ones((1, len(rows))))[0]
-    return mean_figure(comparison, values, by_repetition=False, without="the clip has one motion")
+    return mean_result(comparison, values, by_repetition=False, without="the clip has one motion")
 
 
-def ranks(distance: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """(motion,) how many other sentences are at least as near as the nearest that is its own.
+def ranks(distance: np.ndarray, is_match: np.ndarray) -> np.ndarray:
+    """(motion,) number of wrong sentences that are at least as close as the closest matching sentence.
 
-    distance, own: (motion, sentence) float and bool; every sentence that says the same is its own, so a duplicate in
-    the group is a hit.
+    Args:
+        distance: (motion, sentence) distances in the shared feature space.
+        is_match: (motion, sentence) bool; every sentence with the same prompt matches, so a duplicate is a hit.
     """
-    nearest = np.where(own, distance, np.inf).min(axis=1)
-    return ((distance <= nearest[:, None]) & ~own).sum(axis=1)
+    nearest = np.where(is_match, distance, np.inf).min(axis=1)
+    return ((distance <= nearest[:, None]) & ~is_match).sum(axis=1)
 
 
 class Groups(NamedTuple):
-    """For each motion the sentences it is matched against. ranks, sizes: (motion,); NaN where there is no other."""
+    """The retrieval result of every motion, NaN for a motion without other sentences."""
 
-    ranks: np.ndarray
-    sizes: np.ndarray
+    ranks: np.ndarray  # (motion,) rank of the matching sentence, 0 is best
+    sizes: np.ndarray  # (motion,) number of sentences in the group
 
 
 @lru_cache(maxsize=2)
-def matched_sentences(comparison: Comparison, hard: bool) -> Groups:
-    """The rank of each motion's own sentence among at most 32 that differ in verb, object or hand.
+def sentence_ranks(comparison: Comparison, hard: bool) -> Groups:
+    """The rank of each motion's sentence among at most 32 that differ in verb, object or hand.
 
-    hard: only sentences about the same object, all of them up to 31. Else 31 others drawn anew for every motion.
+    Args:
+        hard: compare with sentences about the same object, at most 31. Otherwise 31 others are sampled per motion.
     """
     predicted, reference = comparison.predicted, comparison.reference
     prompts, first = np.unique(reference.prompt, return_index=True)
     assert reference.text is not None
     assert predicted.text is not None
     texts, objects = reference.text[first], reference.object[first]
-    found = np.full((2, len(predicted)), np.nan)
-    for row in range(len(predicted)):
-        others = np.flatnonzero((prompts != predicted.prompt[row]) & ((not hard) | (objects == predicted.object[row])))
+    ranks_and_sizes = np.full((2, len(predicted)), np.nan)
+    for motion in range(len(predicted)):
+        is_allowed = (not hard) | (objects == predicted.object[motion])
+        others = np.flatnonzero((prompts != predicted.prompt[motion]) & is_allowed)
         if len(others) >= GROUP or not hard:
-            random = np.random.default_rng([SEED, int(predicted.sample[row]), int(predicted.clip[row])])
+            random = np.random.default_rng([SEED, int(predicted.sample[motion]), int(predicted.clip[motion])])
             others = random.permutation(others)[: GROUP - 1]
         if len(others):
-            sentences = np.concatenate((predicted.text[row][None], texts[others]))
-            distance = np.linalg.norm(sentences - predicted.features[row], axis=1)
-            own = np.arange(len(sentences)) == 0
-            found[:, row] = ranks(distance[None], own[None])[0], len(sentences)
-    return Groups(*found)
+            sentences = np.concatenate((predicted.text[motion][None], texts[others]))
+            distance = np.linalg.norm(sentences - predicted.features[motion], axis=1)
+            is_match = np.arange(len(sentences)) == 0
+            ranks_and_sizes[:, motion] = ranks(distance[None], is_match[None])[0], len(sentences)
+    return Groups(*ranks_and_sizes)
 
 
 def r_precision(k: int, hard: bool) -> Measure:
-    def measure(comparison: Comparison) -> Found:
-        found = matched_sentences(comparison, hard)
-        values = np.where(np.isfinite(found.ranks), found.ranks < k, np.nan)
-        return mean_figure(comparison, values, _sizes_in_words(found.sizes), without=NO_OTHERS[hard])
+    """Fraction of motions whose sentence is among the k closest (T2M, Sec. 5); groups as in ``sentence_ranks``."""
+
+    def measure(comparison: Comparison) -> Outcome:
+        groups = sentence_ranks(comparison, hard)
+        values = np.where(np.isfinite(groups.ranks), groups.ranks < k, np.nan)
+        return mean_result(comparison, values, _sizes_in_words(groups.sizes), without=NO_OTHERS[hard])
 
     return measure
 
 
 def r_precision_chance(k: int, hard: bool) -> Measure:
-    """What guessing gives in the same groups."""
+    """The R-precision of random guessing in the same groups."""
 
-    def measure(comparison: Comparison) -> Found:
-        found = matched_sentences(comparison, hard)
-        chance, note = np.minimum(k / found.sizes, 1.0), _sizes_in_words(found.sizes)
-        return mean_figure(comparison, chance, note, without=NO_OTHERS[hard])
+    def measure(comparison: Comparison) -> Outcome:
+        groups = sentence_ranks(comparison, hard)
+        chance, note = np.minimum(k / groups.sizes, 1.0), _sizes_in_words(groups.sizes)
+        return mean_result(comparison, chance, note, without=NO_OTHERS[hard])
 
     return measure
 
 
 def _sizes_in_words(sizes: np.ndarray) -> str:
-    known = sizes[np.isfinite(sizes)].astype(int)
-    if not len(known):
+    counts = sizes[np.isfinite(sizes)].astype(int)
+    if not len(counts):
         return ""
-    low, high = known.min(), known.max()
+    low, high = counts.min(), counts.max()
     return f"groups of {low}" if low == high else f"groups of {low} to {high}"
 
 
-def matching_distance(comparison: Comparison) -> Found:
+def matching_distance(comparison: Comparison) -> Outcome:
+    """Mean distance of a motion from its sentence in the shared feature space."""
     assert comparison.predicted.text is not None
-    return mean_figure(comparison, np.linalg.norm(comparison.predicted.features - comparison.predicted.text, axis=1))
+    return mean_result(comparison, np.linalg.norm(comparison.predicted.features - comparison.predicted.text, axis=1))
 
 
-def memorised(comparison: Comparison) -> Found:
-    """1 where a motion is less than half as far from its nearest training clip as its recorded clip is from its own."""
+def memorised(comparison: Comparison) -> Outcome:
+    """Fraction of motions that are suspiciously close to a training clip.
+
+    A motion counts if its distance to the nearest training clip is below half that of its recorded clip.
+    """
     if comparison.train is None:
         return NO_TRAINING
     sets, train = (comparison.predicted, comparison.reference), comparison.train.features
-    own, usual = (euclidean(encoded.features, train).min(axis=1) for encoded in sets)
-    return mean_figure(comparison, (own < MEMORISED_BELOW * usual[comparison.own_reference]).astype(float))
+    distance, recorded_distance = (euclidean(encoded.features, train).min(axis=1) for encoded in sets)
+    is_close = distance < MEMORISED_BELOW * recorded_distance[comparison.reference_rows]
+    return mean_result(comparison, is_close.astype(float))

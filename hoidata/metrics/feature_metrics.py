@@ -1,16 +1,16 @@
-"""The one list of figures of features, as ``registry.METRICS`` is for geometry: tables and docs are made from it; and
-what encoders say of a predicted store, in the form ``evaluate_store`` gives.
+"""The registry of feature metrics, and their evaluation on a predicted store.
 
-To add one: a function in ``feature_measures.py`` and a row in ``FEATURE_METRICS``.
+To add a metric: a function in ``feature_measures.py`` and an entry in ``FEATURE_METRICS``. Tables and README.md are
+generated from it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 
-from hoidata.metrics.encoded import Asked, EncodedSet, Encoder, encode_sets, recorded, stored_motion
+from hoidata.metrics.encoded import EncodedSet, Encoder, EncoderInput, encode_sets, recorded_motions, stored_motion
 from hoidata.metrics.feature_measures import (
-    FRECHET_DRAWS,
+    FRECHET_RESAMPLES,
     GROUP,
     HALVES,
     MEMORISED_BELOW,
@@ -21,10 +21,10 @@ from hoidata.metrics.feature_measures import (
     confusion,
     diversity,
     diversity_released,
-    floor,
     frechet,
     frechet_train,
     kernel_distance,
+    lower_bound,
     matching_distance,
     memorised,
     multimodality_by_label,
@@ -34,10 +34,10 @@ from hoidata.metrics.feature_measures import (
     r_precision,
     r_precision_chance,
 )
-from hoidata.metrics.feature_sets import TOO_SMALL, Comparison, FeatureFigure, fid_frechet, kid
+from hoidata.metrics.feature_sets import TOO_SMALL, Comparison, FeatureResult, fid_frechet, kid
 from hoidata.metrics.pair import acting_sides
 from hoidata.metrics.paths import PathEncoder
-from hoidata.metrics.registry import Direction
+from hoidata.metrics.registry import OWN, Direction
 from hoidata.metrics.unmeasured import Unmeasured
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import Store
@@ -47,52 +47,62 @@ DIGITS = 6
 
 @dataclass(frozen=True)
 class FeatureMetric:
-    """What one figure is; fields as in ``registry.Metric``. encoder: whose features it looks at.
-
-    note: what a reader must know beside the figure.
-    """
+    """A metric of the features of one encoder; the other fields are those of ``registry.Metric``."""
 
     name: str
+    measure: Measure
+    _: KW_ONLY
     title: str
-    unit: str
+    unit: str = ""
     direction: Direction
     encoder: str
-    measure: Measure
     reduction: str
     source: str
     thresholds: str = ""
     floor_of: str = ""
-    note: str = ""
+    note: str = ""  # a remark for readers of the value
 
     @property
     def topic(self) -> str:
-        """What tables put together: the figures of one encoder."""
+        """The title of the table that has all metrics of the encoder."""
         return f"Features of the evaluator {self.encoder!r}"
 
 
-def feature_findings(
+def feature_results(
     predicted: EncodedSet, reference: EncodedSet, train: EncodedSet | None = None
-) -> dict[str, FeatureFigure | Unmeasured]:
-    """Every figure of the encoder that made the three sets, by name; for one that could not be measured the reason.
+) -> dict[str, FeatureResult | Unmeasured]:
+    """All metrics of the encoder that made the three sets, by name.
 
-    Raises ValueError where the sets come from different encoders.
+    Raises ValueError if the sets come from different encoders.
     """
     sets = [item for item in (predicted, reference, train) if item is not None]
     if len({(item.encoder, item.digest) for item in sets}) != 1:
         raise ValueError("features of different encoders are no distance apart")
     comparison = Comparison(predicted, reference, train)
-    own = [metric for metric in FEATURE_METRICS if metric.encoder == predicted.encoder]
-    return {metric.name: metric.measure(comparison) for metric in own}
+    metrics = [metric for metric in FEATURE_METRICS if metric.encoder == predicted.encoder]
+    return {metric.name: metric.measure(comparison) for metric in metrics}
 
 
-def _of_each(
-    name: str, title: str, direction: Direction, measure: Measure, encoders: tuple[str, ...], *told: str, **more: str
+def _for_encoders(
+    name: str,
+    measure: Measure,
+    *,
+    encoders: tuple[str, ...],
+    title: str,
+    floor_of: str = "",
+    **fields: Any,
 ) -> Iterator[FeatureMetric]:
-    """A metric for each of some encoders. told: reduction, source and what follows; fields as in ``FeatureMetric``."""
+    """One metric per encoder, named ``<name>_<encoder>``; ``fields`` are those of ``FeatureMetric``."""
     for encoder in encoders:
         suffix = encoder.replace("-", "_")
-        own = FeatureMetric(f"{name}_{suffix}", f"{title}, {encoder}", "", direction, encoder, measure, *told, **more)
-        yield replace(own, floor_of=f"{own.floor_of}_{suffix}" if own.floor_of else "")
+        yield FeatureMetric(
+            f"{name}_{suffix}",
+            measure,
+            title=f"{title}, {encoder}",
+            encoder=encoder,
+            floor_of=f"{floor_of}_{suffix}" if floor_of else "",
+            **fields,
+        )
 
 
 BOTH, PAPER, PAIRS, PATHS = ("paper", "corrected"), ("paper",), ("text-motion",), ("path",)
@@ -100,76 +110,92 @@ MEAN, SETS = "mean over motions", "of all clips of a repetition, mean over repet
 IMOS = "IMoS (Ghosh et al. 2023), as released"
 T2M = "T2M (Guo et al. 2022), Sec. 5"
 ROWS_NEEDED = f"at least 4 clips per feature, else {TOO_SMALL!r}"
-DRAWN = f"over clips: {FRECHET_DRAWS} draws of one repetition, their middle moved to the figure"
+RESAMPLED = f"interval over clips: {FRECHET_RESAMPLES} resamples of one repetition, centred on the value"
+DIVISIONS = f"mean of {HALVES} divisions"
 WIDE, HARD = f"groups of {GROUP} distinct sentences", "sentences about the same object"
 FEATURE_METRICS = (
-    *_of_each("accuracy_top1", "top-1 accuracy", "higher", accuracy(1), BOTH, MEAN, IMOS),
-    *_of_each(
-        "accuracy_top3", "top-3 accuracy", "higher", accuracy(3), BOTH, MEAN, "Text2HOI (Cha et al. 2024), Sec. 4.3"
+    *_for_encoders(
+        "accuracy_top1", accuracy(1), encoders=BOTH, title="top-1 accuracy", direction="higher", reduction=MEAN,
+        source=IMOS,
     ),
-    *_of_each(
-        "fid_paired", "paired feature distance", "lower", paired, BOTH, MEAN, f"{IMOS}, called FID there",
-        note="needs pairs; punishes diversity",
+    *_for_encoders(
+        "accuracy_top3", accuracy(3), encoders=BOTH, title="top-3 accuracy", direction="higher", reduction=MEAN,
+        source="Text2HOI (Cha et al. 2024), Sec. 4.3",
     ),
-    *_of_each(
-        "fid_frechet", "Frechet distance", "lower", frechet, BOTH, SETS, "Heusel et al. 2017", ROWS_NEEDED, note=DRAWN
+    *_for_encoders(
+        "fid_paired", paired, encoders=BOTH, title="paired feature distance", direction="lower", reduction=MEAN,
+        source=f"{IMOS}, called FID there", note="needs pairs; penalises diversity",
     ),
-    *_of_each(
-        "fid_frechet_floor", "Frechet distance, half of the truth against half", "lower", floor(fid_frechet), BOTH,
-        f"mean of {HALVES} divisions", "this project", ROWS_NEEDED, "fid_frechet",
+    *_for_encoders(
+        "fid_frechet", frechet, encoders=BOTH, title="Frechet distance (FID)", direction="lower", reduction=SETS,
+        source="Heusel et al. 2017", thresholds=ROWS_NEEDED, note=RESAMPLED,
     ),
-    *_of_each(
-        "fid_frechet_train", "Frechet distance from the training clips", "lower", frechet_train, BOTH, SETS,
-        "Heusel et al. 2017", ROWS_NEEDED, note=DRAWN,
+    *_for_encoders(
+        "fid_frechet_floor", lower_bound(fid_frechet), encoders=BOTH, direction="lower", reduction=DIVISIONS,
+        title="Frechet distance between halves of the recorded clips", source=OWN, thresholds=ROWS_NEEDED,
+        floor_of="fid_frechet",
     ),
-    *_of_each(
-        "kid", "kernel distance", "lower", kernel_distance, BOTH, SETS,
-        "Binkowski et al. 2018, cubic kernel, unbiased",
+    *_for_encoders(
+        "fid_frechet_train", frechet_train, encoders=BOTH, title="Frechet distance from the training clips",
+        direction="lower", reduction=SETS, source="Heusel et al. 2017", thresholds=ROWS_NEEDED, note=RESAMPLED,
     ),
-    *_of_each(
-        "kid_floor", "kernel distance, half of the truth against half", "lower", floor(kid), BOTH,
-        f"mean of {HALVES} divisions", "this project", "", "kid",
+    *_for_encoders(
+        "kid", kernel_distance, encoders=BOTH, title="kernel distance (KID)", direction="lower", reduction=SETS,
+        source="Binkowski et al. 2018, cubic kernel, unbiased",
     ),
-    *_of_each("diversity", "diversity", "nearer the truth", diversity, BOTH, SETS, "all pairs of clips"),
-    *_of_each(
-        "diversity_released", "diversity, as released", "nearer the truth", diversity_released, PAPER, SETS,
-        f"{IMOS}: {RELEASED_PAIRS} pairs with replacement",
+    *_for_encoders(
+        "kid_floor", lower_bound(kid), encoders=BOTH, title="kernel distance between halves of the recorded clips",
+        direction="lower", reduction=DIVISIONS, source=OWN, floor_of="kid",
     ),
-    *_of_each(
-        "multimodality_by_label", "multimodality by label", "nearer the truth", multimodality_by_label, BOTH, SETS,
-        "all pairs within a true label", "labels of two clips or more",
+    *_for_encoders(
+        "diversity", diversity, encoders=BOTH, title="diversity", direction="closer to recorded", reduction=SETS,
+        source="all pairs of clips",
     ),
-    *_of_each(
-        "multimodality_released", "multimodality, as released", "higher", multimodality_released, PAPER, SETS,
-        f"{IMOS}: {RELEASED_PAIRS_OF_LABEL} pairs per predicted label",
+    *_for_encoders(
+        "diversity_released", diversity_released, encoders=PAPER, title="diversity, as released",
+        direction="closer to recorded", reduction=SETS, source=f"{IMOS}: {RELEASED_PAIRS} pairs with replacement",
     ),
-    *_of_each(
-        "multimodality_by_prompt", "multimodality by prompt", "higher", multimodality_by_prompt, BOTH,
-        "mean over clips", f"{T2M}: all pairs of the motions made for one prompt",
+    *_for_encoders(
+        "multimodality_by_label", multimodality_by_label, encoders=BOTH, title="multimodality by label",
+        direction="closer to recorded", reduction=SETS, source="all pairs within a true label",
+        thresholds="labels of two clips or more",
+    ),
+    *_for_encoders(
+        "multimodality_released", multimodality_released, encoders=PAPER, title="multimodality, as released",
+        direction="higher", reduction=SETS, source=f"{IMOS}: {RELEASED_PAIRS_OF_LABEL} pairs per predicted label",
+    ),
+    *_for_encoders(
+        "multimodality_by_prompt", multimodality_by_prompt, encoders=BOTH, title="multimodality by prompt",
+        direction="higher", reduction="mean over clips", source=f"{T2M}: all pairs of motions for one prompt",
     ),
     *(
-        metric for hard in (False, True) for k in (1, 2, 3) for metric in _of_each(
-            f"r_precision_{'hard_' * hard}top{k}", f"R-precision top-{k}{', same object' * hard}", "higher",
-            r_precision(k, hard), PAIRS, MEAN, T2M, HARD if hard else WIDE,
+        metric for hard in (False, True) for k in (1, 2, 3) for metric in _for_encoders(
+            f"r_precision_{'hard_' * hard}top{k}", r_precision(k, hard), encoders=PAIRS, direction="higher",
+            title=f"R-precision top-{k}{', same object' * hard}", reduction=MEAN, source=T2M,
+            thresholds=HARD if hard else WIDE,
         )
     ),
     *(
-        metric for hard in (False, True) for k in (1, 2, 3) for metric in _of_each(
-            f"r_precision_{'hard_' * hard}top{k}_floor", f"R-precision top-{k}{', same object' * hard}, by guessing",
-            "nearer the truth", r_precision_chance(k, hard), PAIRS, MEAN, "this project", HARD if hard else WIDE,
-            f"r_precision_{'hard_' * hard}top{k}",
+        metric for hard in (False, True) for k in (1, 2, 3) for metric in _for_encoders(
+            f"r_precision_{'hard_' * hard}top{k}_floor", r_precision_chance(k, hard), encoders=PAIRS,
+            title=f"R-precision top-{k}{', same object' * hard}, random guessing", direction="closer to recorded",
+            reduction=MEAN, source=OWN, thresholds=HARD if hard else WIDE,
+            floor_of=f"r_precision_{'hard_' * hard}top{k}",
         )
     ),
-    *_of_each("matching_distance", "distance from the own sentence", "lower", matching_distance, PAIRS, MEAN, T2M),
-    *_of_each(
-        "memorised_share", "share of motions near a training clip", "lower", memorised, PATHS, MEAN,
-        "this project: root mean square over joints and object, 15 frames",
-        f"nearer than {MEMORISED_BELOW:g} of what the recorded clip is from its own nearest",
+    *_for_encoders(
+        "matching_distance", matching_distance, encoders=PAIRS, title="distance between motion and sentence",
+        direction="lower", reduction=MEAN, source=T2M,
+    ),
+    *_for_encoders(
+        "memorised_share", memorised, encoders=PATHS, title="fraction of motions close to a training clip",
+        direction="lower", reduction=MEAN, source=f"{OWN}: root mean square over joints and object, 15 frames",
+        thresholds=f"closer than {MEMORISED_BELOW:g} times the distance of the recorded clip",
     ),
 )  # fmt: skip
 
 
-# --- a predicted store beside an annotated one
+# --- evaluation of a predicted store
 
 
 def encoder_summary(
@@ -178,57 +204,60 @@ def encoder_summary(
     store: Store,
     samples: Mapping[str, Sequence[tuple[int, str]]],
 ) -> dict[str, Any]:
-    """Figures of features of the clips in ``samples``: reference id to number and id of each of its predictions.
+    """Feature metrics of the predictions of a store.
 
-    Gives figures, intervals, counts, notes and unmeasured (how many clips lack a value, by reason) by name of the
-    figure, and evaluators: by name the digest of its weights ("path" learnt nothing) and, of a classifier, its labels
-    with how many motions of each were taken for which.
+    Args:
+        samples: by reference id, the number and id of each compared prediction.
+
+    Returns:
+        Entries of a metrics file: figures, intervals, counts, notes and unmeasured by metric; evaluators by encoder,
+        with the digest of the weights and, for a classifier, labels and confusion matrix (label, predicted label).
     """
-    found: dict[str, Any] = {name: {} for name in _BY_FIGURE} | {"evaluators": {}}
+    summary: dict[str, Any] = {name: {} for name in _BY_METRIC} | {"evaluators": {}}
     clips, train = list(samples), annotated.ids("train")
     encoders = [*encoders, PathEncoder()]
     predicted = encode_sets(encoders, _predicted(annotated, store, samples), annotated, clips)
-    reference = encode_sets(encoders, recorded(annotated, clips), annotated, clips)
-    learnt = encode_sets(encoders, recorded(annotated, train), annotated, train) or [None] * len(encoders)
-    for sets in zip(predicted, reference, learnt, strict=True):
-        for name, figure in feature_findings(*sets).items():
-            _add(found, name, figure, len(clips))
-        own = sets[0]
-        found["evaluators"][own.encoder] = {"digest": own.digest}
-        if own.labels:
-            table = {"labels": list(own.labels), "confusion": confusion(own).tolist()}
-            found["evaluators"][own.encoder] |= table
-    return found
+    reference = encode_sets(encoders, recorded_motions(annotated, clips), annotated, clips)
+    training = encode_sets(encoders, recorded_motions(annotated, train), annotated, train) or [None] * len(encoders)
+    for sets in zip(predicted, reference, training, strict=True):
+        for name, result in feature_results(*sets).items():
+            _add(summary, name, result, len(clips))
+        encoded = sets[0]
+        summary["evaluators"][encoded.encoder] = {"digest": encoded.digest}
+        if encoded.labels:
+            table = {"labels": list(encoded.labels), "confusion": confusion(encoded).tolist()}
+            summary["evaluators"][encoded.encoder] |= table
+    return summary
 
 
 def _predicted(
     annotated: AnnotatedStore, store: Store, samples: Mapping[str, Sequence[tuple[int, str]]]
-) -> Iterator[Asked]:
-    """Predicted motions; which hands act and where down is are what the reference says."""
-    for number, (clip_id, own) in enumerate(samples.items()):
+) -> Iterator[EncoderInput]:
+    """Predicted motions, with the acting hands and the gravity direction of their references."""
+    for number, (clip_id, predictions) in enumerate(samples.items()):
         sides, gravity = acting_sides(annotated.hand_type(clip_id)), annotated.store.clip(clip_id).gravity
-        for sample, name in own:
+        for sample, name in predictions:
             motion = stored_motion(store, name)
-            yield Asked(replace(motion, clip=replace(motion.clip, gravity=gravity)), sides, number, sample)
+            yield EncoderInput(replace(motion, clip=replace(motion.clip, gravity=gravity)), sides, number, sample)
 
 
-_BY_FIGURE = ("figures", "intervals", "counts", "notes", "unmeasured")
+_BY_METRIC = ("figures", "intervals", "counts", "notes", "unmeasured")
 
 
-def _add(found: dict[str, Any], name: str, figure: FeatureFigure | Unmeasured, clips: int) -> None:
+def _add(summary: dict[str, Any], name: str, figure: FeatureResult | Unmeasured, clips: int) -> None:
     """clips: how many are compared."""
     if isinstance(figure, Unmeasured):
-        found["unmeasured"][name] = {figure.reason: clips}
+        summary["unmeasured"][name] = {figure.reason: clips}
         return
     if figure.value is None:
-        found["unmeasured"][name] = {figure.note: clips}
+        summary["unmeasured"][name] = {figure.note: clips}
     elif figure.without:
-        found["unmeasured"][name] = {figure.without: clips - figure.clips}
+        summary["unmeasured"][name] = {figure.without: clips - figure.clips}
     if figure.value is not None:
-        found["figures"][name] = round(figure.value, DIGITS) + 0.0  # no minus zero
-        found["counts"][name] = figure.counts
+        summary["figures"][name] = round(figure.value, DIGITS) + 0.0  # no minus zero
+        summary["counts"][name] = figure.counts
     intervals = {"repetitions": figure.repetitions, "clips": figure.bootstrap}
-    if known := {kind: [round(end, DIGITS) for end in ends] for kind, ends in intervals.items() if ends is not None}:
-        found["intervals"][name] = known
+    if rounded := {kind: [round(end, DIGITS) for end in ends] for kind, ends in intervals.items() if ends is not None}:
+        summary["intervals"][name] = rounded
     if figure.note:
-        found["notes"][name] = figure.note
+        summary["notes"][name] = figure.note

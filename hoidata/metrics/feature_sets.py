@@ -1,7 +1,7 @@
-"""Predicted features beside recorded ones, and how values of motions or of whole sets become one figure.
+"""Comparison of predicted with recorded features: distances of sets, and results with intervals.
 
-Distances are pure functions of (row, F) arrays, float64. Sources: FID, Heusel et al. 2017; KID, Binkowski et al. 2018;
-the paired form, IMoS (Ghosh et al. 2023) as released.
+Distances are pure functions of (row, F) float64 arrays, one row per motion. Sources: FID, Heusel et al. 2017; KID,
+Binkowski et al. 2018; the paired distance, IMoS (Ghosh et al. 2023) as released.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,22 +17,17 @@ from hoidata.metrics.intervals import Interval, Statistic, bootstrap_interval, t
 from hoidata.metrics.unmeasured import Unmeasured
 
 
-class FeatureFigure(NamedTuple):
-    """One figure. value: None where it must not be given, for the reason ``note``. clips, motions, values: in it.
+class FeatureResult(NamedTuple):
+    """The value of a feature metric with its counts and 95 % intervals."""
 
-    repetitions: 95 % interval over repetitions (Student), which repeat the sampler; bootstrap: over clips, whole
-    sequences drawn again. None where there is none. note: what was left out, or why there is no value. without: why
-    clips that are not among ``clips`` have no value; "" where all are.
-    """
-
-    value: float | None
+    value: float | None  # None: it would mislead, for the reason ``note``
     clips: int
     motions: int
     values: int
-    repetitions: Interval | None = None
-    bootstrap: Interval | None = None
-    note: str = ""
-    without: str = ""
+    repetitions: Interval | None = None  # over repetitions of sampling (Student's t)
+    bootstrap: Interval | None = None  # over clips, resampling whole source sequences
+    note: str = ""  # a remark, or why the value is missing
+    without: str = ""  # why some clips have no value; "" if all have one
 
     @property
     def counts(self) -> dict[str, int]:
@@ -41,13 +36,10 @@ class FeatureFigure(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Predicted motions beside the recorded clips they were made for, and the clips everything was trained on.
-
-    ``predicted.clip`` and ``reference.clip`` count the same clips; reference has one motion of each.
-    """
+    """Encoded predictions, their recorded reference clips and the training clips."""
 
     predicted: EncodedSet
-    reference: EncodedSet
+    reference: EncodedSet  # one motion per clip; ``clip`` has the same numbers as in ``predicted``
     train: EncodedSet | None
 
     @cached_property
@@ -55,77 +47,85 @@ class Comparison:
         return self.predicted.repetitions()
 
     @cached_property
-    def own_reference(self) -> np.ndarray:
-        """(motion,) the row of each prediction's clip in the reference."""
-        return rows_of(self.predicted.clip, self.reference)
+    def reference_rows(self) -> np.ndarray:
+        """(motion,) row of each prediction's clip in the reference."""
+        return rows_of_clips(self.predicted.clip, self.reference)
 
     @cached_property
     def clips(self) -> np.ndarray:
-        """(clip,) the clips that have a prediction."""
+        """(clip,) sorted indices of the clips that have a prediction."""
         return np.unique(self.predicted.clip)
 
     @cached_property
     def groups(self) -> np.ndarray:
         """(clip,) source sequence of each of ``clips``."""
-        return self.reference.group[rows_of(self.clips, self.reference)]
+        return self.reference.group[rows_of_clips(self.clips, self.reference)]
 
 
-def rows_of(clips: np.ndarray, encoded: EncodedSet) -> np.ndarray:
-    """The row of each clip in a set that has one motion of each clip."""
+def rows_of_clips(clips: np.ndarray, encoded: EncodedSet) -> np.ndarray:
+    """(clip,) row of each clip in a set with one motion per clip."""
     order = np.argsort(encoded.clip, kind="stable")
     return order[np.searchsorted(encoded.clip, clips, sorter=order)]
 
 
-def mean_figure(
+def mean_result(
     comparison: Comparison, values: np.ndarray, note: str = "", by_repetition: bool = True, without: str = "no value"
-) -> FeatureFigure | Unmeasured:
-    """The mean of (motion,) values; NaN are left out, for the reason ``without``.
+) -> FeatureResult | Unmeasured:
+    """The mean of (motion,) values with intervals.
 
-    by_repetition: whether a repetition alone has a figure.
+    Args:
+        values: NaN for motions without a value, which are skipped for the reason ``without``.
+        by_repetition: average within each repetition first. False: average within each clip first.
     """
-    known = np.isfinite(values)
-    if not known.any():
+    has_value = np.isfinite(values)
+    if not has_value.any():
         return Unmeasured(without)
-    clip, sample, values = comparison.predicted.clip[known], comparison.predicted.sample[known], values[known]
-    clips, row = np.unique(clip, return_inverse=True)
-    means = np.bincount(row, values) / np.bincount(row)
-    numbers, which = np.unique(sample, return_inverse=True)
-    runs = np.bincount(which, values) / np.bincount(which)
+    clip, sample = comparison.predicted.clip[has_value], comparison.predicted.sample[has_value]
+    values = values[has_value]
+    clips, clip_of_value = np.unique(clip, return_inverse=True)
+    means = np.bincount(clip_of_value, values) / np.bincount(clip_of_value)
+    numbers, repetition = np.unique(sample, return_inverse=True)
+    runs = np.bincount(repetition, values) / np.bincount(repetition)
     groups = comparison.groups[np.searchsorted(comparison.clips, clips)]
     counts = (len(clips), len(values), len(values))
     over_runs = t_interval(runs) if by_repetition and len(numbers) > 1 else None
     value = float(runs.mean() if by_repetition else means.mean())
     missing = without if len(clips) < len(comparison.clips) else ""
-    return FeatureFigure(value, *counts, over_runs, bootstrap_interval(means, groups), note, missing)
+    over_clips = bootstrap_interval(means, groups)
+    return FeatureResult(value, *counts, repetitions=over_runs, bootstrap=over_clips, note=note, without=missing)
 
 
-def set_figure(
+def set_result(
     comparison: Comparison,
     runs: Sequence[float],
     values: np.ndarray,
     statistic: Statistic,
     note: str = "",
     without: str = "fewer than two clips",
-) -> FeatureFigure | Unmeasured:
-    """A figure of whole sets: (repetition,) figures, and what ``statistic`` needs of the clips to draw them again.
+) -> FeatureResult | Unmeasured:
+    """The mean of a metric of whole sets over repetitions, with intervals.
 
-    without: why it has none where no repetition has one.
+    Args:
+        runs: the value of each repetition; repetitions that are not finite are skipped.
+        values: the input of ``statistic`` per clip, for the bootstrap.
+        without: the reason if no repetition has a value.
     """
     runs = [run for run in runs if np.isfinite(run)]
     if not runs:
         return Unmeasured(without)
-    drawn = bootstrap_interval(values, comparison.groups, statistic)
+    over_clips = bootstrap_interval(values, comparison.groups, statistic)
     counts = (len(comparison.clips), len(comparison.predicted), len(runs))
-    return FeatureFigure(float(np.mean(runs)), *counts, t_interval(runs), drawn, note)
+    value = float(np.mean(runs))
+    return FeatureResult(value, *counts, repetitions=t_interval(runs), bootstrap=over_clips, note=note)
 
 
-def mean_matrix(comparison: Comparison, of: Callable[[EncodedSet], np.ndarray]) -> np.ndarray:
-    """(clip, clip) mean over the repetitions of a (motion, motion) matrix of each."""
+def mean_matrix(comparison: Comparison, matrix_of: Callable[[EncodedSet], np.ndarray]) -> np.ndarray:
+    """(clip, clip) mean over the repetitions of each one's (motion, motion) matrix."""
     total = np.zeros((len(comparison.clips),) * 2)
     count = np.zeros_like(total)
     for run in comparison.repetitions:
         rows = np.searchsorted(comparison.clips, run.clip)
-        total[np.ix_(rows, rows)] += of(run)
+        total[np.ix_(rows, rows)] += matrix_of(run)
         count[np.ix_(rows, rows)] += 1
     return total / np.maximum(count, 1)
 
@@ -135,50 +135,53 @@ TOO_SMALL = "N too small"
 
 
 def fid_paired(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(row,) squared distance of paired features plus that of their spreads over the F units (ddof 1).
+    """(row,) squared distance of paired features plus squared difference of their standard deviations over F (ddof 1).
 
-    What IMoS's released "FID" averages: it runs on one clip at a time. It needs pairs and punishes diversity.
+    The "FID" of IMoS's released code averages this, one clip at a time. It needs pairs and penalises diversity.
     """
     spread = one.std(axis=1, ddof=1) - other.std(axis=1, ddof=1)
     return np.square(one - other).sum(axis=1) + np.square(spread)
 
 
-def enough_rows(features: np.ndarray) -> bool:
-    """At least 4 rows per feature: with fewer, two draws of one distribution seem far apart (``TOO_SMALL``)."""
+def has_enough_rows(features: np.ndarray) -> bool:
+    """Whether there are at least 4 rows per feature: below, two samples of one distribution seem far apart."""
     return len(features) >= ROWS_PER_FEATURE * features.shape[1]
 
 
 def fid_frechet(one: np.ndarray, other: np.ndarray) -> float | None:
-    """Frechet distance of the Gaussians of two sets; None where either has too few rows to know its covariance."""
-    if not (enough_rows(one) and enough_rows(other)):
+    """Frechet distance of the Gaussians of two sets; None if a set is too small to estimate its covariance."""
+    if not (has_enough_rows(one) and has_enough_rows(other)):
         return None
     return frechet_distance(*gaussian(one), *gaussian(other))
 
 
 def gaussian(features: np.ndarray, weights: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (F,) and covariance (F, F) with ddof 1. weights: (row,) how often each row counts."""
+    """Mean (F,) and covariance (F, F) with ddof 1, rows counted (row,) ``weights`` times."""
     count = np.ones(len(features)) if weights is None else weights
     mean = count @ features / count.sum()
-    apart = features - mean
-    return mean, (apart * count[:, None]).T @ apart / (count.sum() - 1)
+    centred = features - mean
+    return mean, (centred * count[:, None]).T @ centred / (count.sum() - 1)
 
 
 def frechet_distance(mean: np.ndarray, cov: np.ndarray, other_mean: np.ndarray, other_cov: np.ndarray) -> float:
-    """``|m1 - m2|^2 + tr C1 + tr C2 - 2 tr (C1 C2)^(1/2)``, the root by eigenvalues, which are never complex."""
+    """``|m1 - m2|^2 + tr C1 + tr C2 - 2 tr (C1 C2)^(1/2)`` (Heusel et al. 2017).
+
+    The root is taken of the symmetric C1^(1/2) C2 C1^(1/2), whose eigenvalues are never complex.
+    """
     value, vector = np.linalg.eigh(cov)
     root = vector * np.sqrt(np.maximum(value, 0)) @ vector.T
     cross = np.linalg.eigvalsh(root @ other_cov @ root)
-    apart = np.square(mean - other_mean).sum()
-    return float(apart + np.trace(cov) + np.trace(other_cov) - 2 * np.sqrt(np.maximum(cross, 0)).sum())
+    mean_distance = np.square(mean - other_mean).sum()
+    return float(mean_distance + np.trace(cov) + np.trace(other_cov) - 2 * np.sqrt(np.maximum(cross, 0)).sum())
 
 
 def cubic_kernel(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(row, other row) ``(x.y / F + 1)^3``."""
+    """(row, other row) kernel values ``(x.y / F + 1)^3``."""
     return (one @ other.T / one.shape[1] + 1) ** 3
 
 
 def kid(one: np.ndarray, other: np.ndarray) -> float:
-    """Unbiased squared distance of the kernel means of two sets, cubic kernel; NaN with fewer than two rows."""
+    """Unbiased squared kernel distance (MMD) of two sets, cubic kernel; NaN with fewer than two rows."""
     if min(len(one), len(other)) < 2:
         return np.nan
     same = [mean_of_pairs(cubic_kernel(rows, rows), np.ones((1, len(rows))))[0] for rows in (one, other)]
@@ -186,14 +189,15 @@ def kid(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def euclidean(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(row, other row) distances."""
+    """(row, other row) Euclidean distances."""
     return cdist(one, other)
 
 
 def mean_of_pairs(matrix: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(draw,) mean over all pairs of two different rows of a symmetric (row, row) matrix; NaN with fewer than two.
+    """(resample,) mean over all pairs of different rows of a symmetric (row, row) matrix; NaN with fewer than two.
 
-    weights: (draw, row) how often each row counts; a row is never a pair with itself.
+    Args:
+        weights: (resample, row) how often each row counts; a row never pairs with itself.
     """
     off = matrix - np.diag(np.diag(matrix))
     pairs = np.square(weights.sum(axis=1)) - np.square(weights).sum(axis=1)
@@ -201,7 +205,7 @@ def mean_of_pairs(matrix: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def mean_with_itself(matrix: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(draw,) mean over all pairs of rows of a (row, row) matrix, a row with itself among them; weights as above."""
+    """(resample,) mean over all pairs of rows of a (row, row) matrix, including a row with itself."""
     return _total(matrix, weights) / np.square(weights.sum(axis=1))
 
 

@@ -1,4 +1,4 @@
-"""95 % intervals: over repetitions, which repeat the sampler, and over clips, which are what the figure is about."""
+"""95 % confidence intervals of a metric: over repetitions of sampling, and over clips."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,23 +8,23 @@ from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
 LEVEL = 0.95
-DRAWS = 2_000
+RESAMPLES = 2_000
 SEED = 0
-WEIGHTS_AT_ONCE = 2**20
-Statistic = Callable[[np.ndarray, np.ndarray], np.ndarray]  # of values (clip, ...) and weights (draw, clip): (draw,)
+MOST_WEIGHTS = 2**20  # weights in memory at a time
+Statistic = Callable[[np.ndarray, np.ndarray], np.ndarray]  # values (clip, ...), weights (resample, clip): (resample,)
 
 
 class Interval(NamedTuple):
-    """From ``low`` to ``high``, in the unit of the figure."""
+    """From ``low`` to ``high``, in the unit of the metric."""
 
     low: float
     high: float
 
 
 def t_interval(values_by_repetition: ArrayLike) -> Interval | None:
-    """Student's interval of the mean over repetitions; None for fewer than two.
+    """Student's t interval of the mean over (repetition,) values; None for fewer than two.
 
-    values_by_repetition: (repetition,) the figure of each. For 20 repetitions mean +- 2.093 s / sqrt(20), ddof 1.
+    For 20 repetitions this is mean +- 2.093 s / sqrt(20), ddof 1.
     """
     values = np.asarray(values_by_repetition, dtype=np.float64)
     if len(values) < 2:
@@ -34,7 +34,7 @@ def t_interval(values_by_repetition: ArrayLike) -> Interval | None:
 
 
 def weighted_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(draw,) the mean of (clip,) values under each row of (draw, clip) weights."""
+    """(resample,) weighted means of (clip,) values under (resample, clip) weights."""
     return weights @ values / weights.sum(axis=1)
 
 
@@ -42,27 +42,29 @@ def bootstrap_interval(
     values_by_clip: ArrayLike,
     groups: ArrayLike,
     statistic: Statistic = weighted_mean,
-    draws: int = DRAWS,
+    resamples: int = RESAMPLES,
     seed: int = SEED,
-    about: float | None = None,
+    centre: float | None = None,
 ) -> Interval | None:
-    """Percentile interval of a figure when whole groups of clips are drawn again with replacement; None for one group.
+    """Bootstrap percentile interval, resampling whole groups of clips with replacement; None for one group.
 
-    values_by_clip: (clip, ...) of any shape the statistic knows; no NaN: a clip without a value is left out before.
-    groups: (clip,) labels, the source sequence of each; all samples of a clip belong to its group. statistic: of these
-    values and of (draw, clip) weights, how often each clip was drawn; gives (draw,) figures, NaN where it has none.
-    about: the figure itself, to move the middle of the draws there, where drawing again adds to any figure.
+    Args:
+        values_by_clip: (clip, ...) in the shape that the statistic takes, without NaN.
+        groups: (clip,) labels: the source sequence of each clip. All samples of a clip are in one group.
+        statistic: maps the values and (resample, clip) counts to (resample,) results, NaN if undefined.
+        centre: shifts the interval so that its median is here. Resampling inflates some statistics: duplicates
+            shrink the covariance.
     """
     values, (names, group) = np.asarray(values_by_clip), np.unique(np.asarray(groups), return_inverse=True)
     if len(names) < 2:
         return None
-    drawn = np.random.default_rng(seed).multinomial(len(names), np.full(len(names), 1 / len(names)), size=draws)
-    rows = max(1, WEIGHTS_AT_ONCE // len(group))
-    chunks = [drawn[start : start + rows, group].astype(np.float64) for start in range(0, draws, rows)]
-    figures = np.concatenate([statistic(values, weights) for weights in chunks])
-    figures = figures[np.isfinite(figures)]
-    if not len(figures):
+    counts = np.random.default_rng(seed).multinomial(len(names), np.full(len(names), 1 / len(names)), size=resamples)
+    chunk = max(1, MOST_WEIGHTS // len(group))
+    chunks = [counts[start : start + chunk, group].astype(np.float64) for start in range(0, resamples, chunk)]
+    results = np.concatenate([statistic(values, weights) for weights in chunks])
+    results = results[np.isfinite(results)]
+    if not len(results):
         return None
-    low, middle, high = np.quantile(figures, ((1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2))
-    shift = 0.0 if about is None else about - middle
+    low, middle, high = np.quantile(results, ((1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2))
+    shift = 0.0 if centre is None else centre - middle
     return Interval(float(low + shift), float(high + shift))

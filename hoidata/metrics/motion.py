@@ -1,8 +1,6 @@
-"""How far joints are from the truth, how smoothly they move, what the object does, how long it all takes; and
-ManipNet's physical measures: can the contacts carry the object?
+"""Metrics of one motion: joint error, smoothness, action, length, and the physical realism of ManipNet.
 
-Each function gives the values of one motion, or why there are none. Of the physical ones there are none without known
-gravity, or where the object is never lifted.
+Each function returns the values of one motion, or why it has none. Physical realism needs gravity and a lifted object.
 """
 
 from functools import lru_cache
@@ -12,7 +10,7 @@ import numpy as np
 from hoidata.actions.action import action_numbers, object_middle_m
 from hoidata.clips.clip import FPS, SIDES, Side
 from hoidata.metrics.pair import Pair
-from hoidata.metrics.touch import made_entries
+from hoidata.metrics.touch import contact_entries
 from hoidata.metrics.unmeasured import NO_GRAVITY, Unmeasured, Values
 from hoidata.physics.mano_capsules import world_rotmats
 from hoidata.physics.realism import VARIANTS, Realism, has_acceleration, score, smoothness_m_s2
@@ -21,61 +19,61 @@ from hoidata.physics.scene import Scene
 NO_VERB = Unmeasured("the clip has no verb")
 
 
-def joint_error_mm(pair: Pair, every: int) -> np.ndarray:
-    """(hand and frame,) mean distance of the 21 joints from those of the reference, millimetres, in its world."""
-    each = []
+def joint_error_mm(pair: Pair, frame_step: int) -> np.ndarray:
+    """(hand and frame,) mean distance of the 21 joints from those of the reference in the world frame, millimetres."""
+    errors_m = []
     for side in pair.sides:
-        frames = pair.frames(side, every)
-        apart = pair.predicted.joints_m[side][frames] - pair.reference.joints_m[side][frames]
-        each.append(np.linalg.norm(apart.astype(np.float64), axis=-1).mean(axis=-1))
-    return 1000 * _joined(each)
+        frames = pair.frames(side, frame_step)
+        offset_m = pair.predicted.joints_m[side][frames] - pair.reference.joints_m[side][frames]
+        errors_m.append(np.linalg.norm(offset_m.astype(np.float64), axis=-1).mean(axis=-1))
+    return 1000 * _concatenated(errors_m)
 
 
-def smoothness(pair: Pair, every: int) -> np.ndarray:
-    """(hand,) mean acceleration of the joints in the wrist's frame, m/s^2, of hands seen in three frames in a row."""
-    del every  # a derivative needs every frame
-    found = []
+def smoothness(pair: Pair, frame_step: int) -> np.ndarray:
+    """(hand,) mean acceleration of the joints in the wrist's frame, m/s^2; needs three successive valid frames."""
+    del frame_step  # a derivative needs every frame
+    accelerations = []
     for side in pair.sides:
-        joints = _seen(pair, side)
+        joints = _visible_joints(pair, side)
         if has_acceleration(joints, FPS):
             wrist = world_rotmats(pair.predicted.clip.hands[side])[:, 0]
-            found.append(smoothness_m_s2(joints, wrist, FPS))
-    return np.array(found)
+            accelerations.append(smoothness_m_s2(joints, wrist, FPS))
+    return np.array(accelerations)
 
 
-def jitter_m_s3(pair: Pair, every: int) -> np.ndarray:
-    """(hand and frame,) mean over the joints of the third difference of world positions, m/s^3."""
-    del every  # a derivative needs every frame
-    each = []
+def jitter_m_s3(pair: Pair, frame_step: int) -> np.ndarray:
+    """(hand and frame,) mean over the joints of the third difference (jerk) of world positions, m/s^3."""
+    del frame_step  # a derivative needs every frame
+    jitters = []
     for side in pair.sides:
-        third = np.linalg.norm(np.diff(_seen(pair, side), n=3, axis=0), axis=-1).mean(axis=-1) * FPS**3
-        each.append(third[np.isfinite(third)])
-    return _joined(each)
+        third = np.linalg.norm(np.diff(_visible_joints(pair, side), n=3, axis=0), axis=-1).mean(axis=-1) * FPS**3
+        jitters.append(third[np.isfinite(third)])
+    return _concatenated(jitters)
 
 
-def object_jitter_m_s3(pair: Pair, every: int) -> np.ndarray:
-    """(frame,) third difference of the world position of the object's middle, m/s^3."""
-    del every  # a derivative needs every frame
+def object_jitter_m_s3(pair: Pair, frame_step: int) -> np.ndarray:
+    """(frame,) third difference (jerk) of the world position of the object's centre, m/s^3."""
+    del frame_step  # a derivative needs every frame
     third = np.diff(object_middle_m(pair.predicted.clip.object).astype(np.float64), n=3, axis=0)
     return np.linalg.norm(third, axis=-1) * FPS**3
 
 
-def length_error_frames(pair: Pair, every: int) -> Values:
-    """(1,) by how many frames the length a family chose is wrong, either way; none where the length was given."""
-    del every
+def length_error_frames(pair: Pair, frame_step: int) -> Values:
+    """(1,) absolute error of an estimated length, frames; unmeasured if the length was given."""
+    del frame_step
     wrong = abs(pair.predicted.clip.n_frames - pair.reference.clip.n_frames)
     return Unmeasured("the length was given") if pair.aligned else np.array([float(wrong)])
 
 
-def length_error_share(pair: Pair, every: int) -> Values:
-    """(1,) the same as a share of the true length."""
-    wrong = length_error_frames(pair, every)
+def length_error_share(pair: Pair, frame_step: int) -> Values:
+    """(1,) absolute error of an estimated length as a fraction of the recorded length."""
+    wrong = length_error_frames(pair, frame_step)
     return wrong if isinstance(wrong, Unmeasured) else wrong / pair.reference.clip.n_frames
 
 
-def action_followed(pair: Pair, every: int) -> Values:
-    """(1,) 1 where the object does what the verb says, else 0; none where nothing is known of the verb."""
-    del every
+def action_followed(pair: Pair, frame_step: int) -> Values:
+    """(1,) 1 if the object's motion satisfies the rules of the verb, else 0; unmeasured for a verb without rules."""
+    del frame_step
     if pair.verb is None:
         return NO_VERB
     if pair.actions is None or pair.verb not in pair.actions.limits:
@@ -84,9 +82,9 @@ def action_followed(pair: Pair, every: int) -> Values:
     return NO_GRAVITY if followed is None else np.array([float(followed)])
 
 
-def action_named(pair: Pair, every: int) -> Values:
-    """(1,) 1 where the verb whose training clips move the object most alike is the one asked for, else 0."""
-    del every
+def action_named(pair: Pair, frame_step: int) -> Values:
+    """(1,) 1 if the nearest centroid of training clips belongs to the requested verb, else 0."""
+    del frame_step
     if pair.verb is None:
         return NO_VERB
     if pair.actions is None or pair.verb not in pair.actions.centroids:
@@ -97,63 +95,63 @@ def action_named(pair: Pair, every: int) -> Values:
 
 @lru_cache(maxsize=1)
 def _action(pair: Pair) -> dict[str, float]:
-    """What the object of the prediction does, in numbers."""
+    """Motion measures of the predicted object (``hoidata.actions``), by name."""
     clip = pair.predicted.clip
     touching = np.zeros((len(SIDES), clip.n_frames), bool)
-    for side, near in made_entries(pair).items():
+    for side, near in contact_entries(pair).items():
         touching[SIDES.index(side), near["frame"]] = True
     return action_numbers(clip.object, pair.reference.clip.gravity, touching)
 
 
-def _seen(pair: Pair, side: Side) -> np.ndarray:
-    """(frame, 21, 3) float64 predicted joints, NaN in frames without the hand."""
+def _visible_joints(pair: Pair, side: Side) -> np.ndarray:
+    """(frame, 21, 3) float64 predicted world joints, NaN in frames in which the hand is not measured."""
     return np.where(pair.valid(side)[:, None, None], pair.predicted.joints_m[side].astype(np.float64), np.nan)
 
 
-def _joined(each: list[np.ndarray]) -> np.ndarray:
-    return np.concatenate([np.zeros(0), *each])
+def _concatenated(arrays: list[np.ndarray]) -> np.ndarray:
+    return np.concatenate([np.zeros(0), *arrays])
 
 
-def realism_si(pair: Pair, every: int) -> Values:
-    """(scored frame,) 1 where friction forces at the contacts give the object's motion, in SI units."""
-    return _passed(pair, "SI", every)
+def realism_si(pair: Pair, frame_step: int) -> Values:
+    """(scored frame,) 1 where friction forces at the contacts explain the object's motion, in SI units."""
+    return _explained(pair, "SI", frame_step)
 
 
-def realism_as_released(pair: Pair, every: int) -> Values:
-    """(scored frame,) the same with the units of ManipNet's released sources."""
-    return _passed(pair, "as released", every)
+def realism_as_released(pair: Pair, frame_step: int) -> Values:
+    """(scored frame,) as ``realism_si``, with the units of ManipNet's released code."""
+    return _explained(pair, "as released", frame_step)
 
 
-def floor_si(pair: Pair, every: int) -> Values:
-    """(lifted frame,) the same in SI units with no hands: 1 only in free fall."""
-    return _floor(pair, "SI", every)
+def floor_si(pair: Pair, frame_step: int) -> Values:
+    """(lifted frame,) as ``realism_si`` without hands: 1 only in free fall. Lower bound of the metric."""
+    return _floor(pair, "SI", frame_step)
 
 
-def floor_as_released(pair: Pair, every: int) -> Values:
-    """(lifted frame,) the same as released with no hands."""
-    return _floor(pair, "as released", every)
+def floor_as_released(pair: Pair, frame_step: int) -> Values:
+    """(lifted frame,) as ``realism_as_released`` without hands."""
+    return _floor(pair, "as released", frame_step)
 
 
-def capsule_depth_mm(pair: Pair, every: int) -> Values:
-    """(1,) mean depth over the hand capsules that overlap the object, in lifted frames, millimetres; none without."""
-    found = _score(pair, "SI", every)
-    if isinstance(found, Unmeasured):
-        return found
-    if np.isnan(found.colliding_m):
+def capsule_depth_mm(pair: Pair, frame_step: int) -> Values:
+    """(1,) mean depth over the hand capsules that overlap the object in lifted frames, millimetres."""
+    realism = _realism(pair, "SI", frame_step)
+    if isinstance(realism, Unmeasured):
+        return realism
+    if np.isnan(realism.colliding_m):
         return Unmeasured("no hand capsule overlaps the object in a lifted frame")
-    return np.array([1000 * found.colliding_m])
+    return np.array([1000 * realism.colliding_m])
 
 
-def _passed(pair: Pair, variant: str, every: int) -> Values:
-    found = _score(pair, variant, every)
-    return found if isinstance(found, Unmeasured) else found.passed.astype(np.float64)
+def _explained(pair: Pair, variant: str, frame_step: int) -> Values:
+    realism = _realism(pair, variant, frame_step)
+    return realism if isinstance(realism, Unmeasured) else realism.passed.astype(np.float64)
 
 
-def _floor(pair: Pair, variant: str, every: int) -> Values:
+def _floor(pair: Pair, variant: str, frame_step: int) -> Values:
     bare = _without_hands(pair)
     if isinstance(bare, Unmeasured):
         return bare
-    return score(bare, VARIANTS[variant], _looked_at(bare.lifted, every)).passed.astype(np.float64)
+    return score(bare, VARIANTS[variant], _every_nth(bare.lifted, frame_step)).passed.astype(np.float64)
 
 
 @lru_cache(maxsize=1)
@@ -165,15 +163,15 @@ def _without_hands(pair: Pair) -> Scene | Unmeasured:
 
 
 @lru_cache(maxsize=2)
-def _score(pair: Pair, variant: str, every: int) -> Realism | Unmeasured:
+def _realism(pair: Pair, variant: str, frame_step: int) -> Realism | Unmeasured:
     scene = pair.scene
     if isinstance(scene, Unmeasured):
         return scene
-    return score(scene, VARIANTS[variant], _looked_at(scene.lifted, every))
+    return score(scene, VARIANTS[variant], _every_nth(scene.lifted, frame_step))
 
 
-def _looked_at(lifted: np.ndarray, every: int) -> np.ndarray:
-    """Every n-th lifted frame, as (frame,) bool. Derivatives are taken over all frames before any is left out."""
+def _every_nth(lifted: np.ndarray, frame_step: int) -> np.ndarray:
+    """Every n-th lifted frame, as (frame,) bool. Derivatives use all frames; only the scored frames are thinned."""
     chosen = np.zeros_like(lifted)
-    chosen[np.flatnonzero(lifted)[::every]] = True
+    chosen[np.flatnonzero(lifted)[::frame_step]] = True
     return chosen

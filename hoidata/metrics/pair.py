@@ -1,4 +1,4 @@
-"""A predicted clip beside the clip it was made for: what every metric is a function of."""
+"""A predicted clip paired with its reference clip: the input of every metric."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from hoidata.actions.action import Actions
 from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import HandPair
-from hoidata.metrics.asked import AskedDistances
+from hoidata.metrics.target_contact import AskedDistances
 from hoidata.metrics.unmeasured import NO_GRAVITY, NO_INSIDE, Unmeasured
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.scene import Scene, clip_scene
@@ -18,14 +18,11 @@ from hoidata.physics.scene import Scene, clip_scene
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """One clip and the joints of its hands.
-
-    joints_m: per side (frame, 21, 3) world, metres. hands: the model of the clip's hand parameters.
-    """
+    """One clip and the joints of its hands."""
 
     clip: Clip
-    joints_m: Mapping[Side, np.ndarray]
-    hands: HandPair
+    joints_m: Mapping[Side, np.ndarray]  # per side (frame, 21, 3), world frame
+    hands: HandPair  # the model of the clip's hand parameters
 
     def joints_in_object(self, side: Side, frames: np.ndarray) -> np.ndarray:
         """(chosen frame, 21, 3) float64 joints of one hand in the object frame, metres."""
@@ -38,59 +35,50 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class TrueContact:
-    """The contact map a clip was recorded with, as the contact stage made it.
+    """The contact map of the recorded clip, as the contact stage computed it."""
 
-    index: over the sampled points of the object; part: (point,) the part each of them belongs to. touched: (point,)
-    bool, nearer to a joint of an acting hand than ``threshold_m`` (metres) in any frame of the pair.
-    """
-
-    index: ProximityIndex
-    part: np.ndarray
-    touched: np.ndarray
+    index: ProximityIndex  # over the sampled points of the object
+    part: np.ndarray  # (point,) the object part of each point
+    touched: np.ndarray  # (point,) bool: within the threshold of a joint of an acting hand in any frame of the pair
     threshold_m: float
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two motions in the world of the reference clip.
-
-    sides: the hands that act in the reference clip. table_m: height of the table the object of the whole reference clip
-    rests on; None where gravity is not known. aligned: frame ``i`` of both is the same moment, and the prediction has
-    its hands wherever the reference has; else the family chose its own length. asked: (point,) bool, the contact map
-    the prediction was made for, or None; asked_distances: the map of distances, or None. verb: of the reference clip;
-    actions: what verbs ask of a motion.
-    """
+    """A predicted and a reference motion in the world frame of the reference clip."""
 
     predicted: Motion
     reference: Motion
-    sides: tuple[Side, ...]
+    sides: tuple[Side, ...]  # the hands that act in the reference clip
     contact: TrueContact
-    table_m: float | None
+    table_m: float | None  # height of the table under the object of the whole reference clip; None without gravity
+    # Frame i of both is the same moment, and the prediction has its hands wherever the reference has them.
+    # False: the family chose the length.
     aligned: bool = True
-    asked: np.ndarray | None = None
-    verb: str | None = None
-    actions: Actions | None = None
-    asked_distances: AskedDistances | None = None
+    target_contact: np.ndarray | None = None  # (point,) bool, the contact map that the prediction was conditioned on
+    verb: str | None = None  # of the reference clip
+    actions: Actions | None = None  # usual motion measures per verb
+    target_distances: AskedDistances | None = None  # the distance map that the prediction was conditioned on
 
     @property
     def _timed(self) -> Clip:
-        """The clip that says which frames are looked at."""
+        """The clip whose hands and frames select what is measured."""
         return (self.reference if self.aligned else self.predicted).clip
 
     def valid(self, side: Side) -> np.ndarray:
-        """(frame,) bool: the frames of the prediction in which this hand is looked at: none that was made."""
+        """(frame,) bool: the frames of the prediction in which this hand is measured; never an interpolated one."""
         return self._timed.hands[side].valid & self._timed.recorded
 
-    def frames(self, side: Side, every: int = 1) -> np.ndarray:
-        """Every n-th of the frames in which this hand is looked at."""
-        return np.flatnonzero(self.valid(side))[::every]
+    def frames(self, side: Side, frame_step: int = 1) -> np.ndarray:
+        """Indices of every n-th frame in which this hand is measured."""
+        return np.flatnonzero(self.valid(side))[::frame_step]
 
     def looked_at(self) -> np.ndarray:
-        """(frame,) bool: the frames in which any acting hand is looked at."""
+        """(frame,) bool: the frames in which any acting hand is measured."""
         return np.any([self.valid(side) for side in self.sides], axis=0)
 
     def triples(self) -> np.ndarray:
-        """(triple, 3) numbers of recorded frames that follow each other, as far apart before the middle as after it."""
+        """(triple, 3) indices of three successive recorded frames with equal spacing."""
         recorded = np.flatnonzero(self._timed.recorded)
         triples = np.stack((recorded[:-2], recorded[1:-1], recorded[2:]), axis=1)
         return triples[np.ptp(np.diff(triples, axis=1), axis=1) == 0]
@@ -99,7 +87,7 @@ class Pair:
     def scene(self) -> Scene | Unmeasured:
         """The acting hands of the prediction and its object, on the table of the reference clip.
 
-        Unmeasured where gravity is not known, where the object encloses no solid, and for less than three frames.
+        Unmeasured without gravity, for an object that is not a closed solid, and below three frames.
         """
         clip = self.predicted.clip
         if self.table_m is None:
@@ -113,11 +101,11 @@ class Pair:
         return clip_scene(replace(clip, hands=hands, gravity=gravity), self.predicted.hands, self.table_m)
 
     def _present(self, side: Side) -> np.ndarray:
-        """(frame,) bool: the hand acts and is looked at."""
+        """(frame,) bool: the hand acts and is measured."""
         valid = self.valid(side)
         return valid if side in self.sides else np.zeros_like(valid)
 
 
 def acting_sides(hand_type: str) -> tuple[Side, ...]:
-    """The sides that "left", "right" or "both" names, left first."""
+    """The sides of the hand type "left", "right" or "both", left first."""
     return tuple(side for side in SIDES if hand_type in (side, "both"))

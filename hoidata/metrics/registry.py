@@ -1,12 +1,12 @@
-"""The one list of metrics: evaluation, the tables on pages and README.md beside this file are made from it.
+"""The registry of metrics. Evaluation, the tables on pages and README.md in this folder are generated from it.
 
-To add one: a function of (pair, every) that gives the values of one motion as an array, or ``Unmeasured`` with the
-reason, and a row here. A list of
-``asked_metrics.py`` is computed only where it is asked for.
+To add a metric: write a function of (pair, frame_step) that returns the values of one motion as an array, or
+``Unmeasured`` with the reason, and add an entry to ``METRICS``. Lists in ``optional_metrics.py`` are computed only on
+request.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -17,48 +17,39 @@ from hoidata.metrics.unmeasured import Unmeasured, Values, counted
 from hoidata.physics.realism import LARGEST_PENETRATION_M
 from hoidata.physics.scene import LIFTED_M
 
-Direction = Literal["higher", "lower", "nearer the truth"]
+Direction = Literal["higher", "lower", "closer to recorded"]
 Topic = Literal["Action", "Contact", "Physics", "Motion", "BimArt"]
 Reduction = Literal["best of a clip's samples", "mean over motions", "mean over frames"]
+HANDS = "frames in which the reference has the acting hand"
+OWN = "this project"
 
 
 @dataclass(frozen=True)
 class Metric:
-    """What one figure is.
+    """How one metric is measured on a motion, reduced over motions, ranked and described."""
 
-    topic: what it is about; tables are divided so. name: its key in files. title: in words. unit: of the figure; ""
-    for a share or score from 0 to 1.
-    direction: which figures are better; "nearer the truth": than the figure of the recorded clips themselves.
-    measure: the values of one motion, given every how many frames to look at, or why it has none.
-    reduction: how values become one figure. "best of a clip's samples": the mean of each motion's values, the best of
-    each clip, the mean over clips; "mean over motions": the mean of each motion's values, the mean over motions; "mean
-    over frames": of all values of all motions alike.
-    frames: which frames count, in words. every: of these, look at every n-th. samples: motions per clip that are looked
-    at; None: all. thresholds: in words. source: where the definition comes from.
-    floor_of: the metric of which this is what it gives for nothing; no figure of a floor is better than another.
-    aligned: compares frame by frame, so there is no figure for motions of a length their family chose.
-    together: ``measure`` gets the pairs of all motions of a clip in a list, instead of one pair.
-    """
-
-    topic: Topic
-    name: str
-    title: str
-    unit: str
-    direction: Direction
-    measure: Callable[..., Values]
-    reduction: Reduction
-    frames: str
-    source: str
-    every: int = 1
-    samples: int | None = None
-    thresholds: str = ""
-    floor_of: str = ""
-    aligned: bool = False
-    together: bool = False
+    name: str  # key in metrics files
+    measure: Callable[..., Values]  # (pair, frame_step): the values of one motion, or why it has none
+    _: KW_ONLY
+    topic: Topic  # tables are grouped by topic
+    title: str  # column header
+    unit: str = ""  # "" for a fraction or a score from 0 to 1
+    direction: Direction  # which values are better; "closer to recorded": than the value of the recorded clips
+    # "best of a clip's samples" and "mean over motions" take the mean of each motion's values first;
+    # "mean over frames" pools all values of all motions.
+    reduction: Reduction = "mean over motions"
+    frames: str = HANDS  # which frames are measured, in words
+    source: str = OWN  # where the definition comes from
+    frame_step: int = 1  # every n-th of these frames is measured
+    samples: int | None = None  # how many motions of a clip are measured; None: all
+    thresholds: str = ""  # in words
+    floor_of: str = ""  # the metric whose lower bound this is; bounds are not ranked
+    aligned: bool = False  # compares frame by frame, so motions of estimated length have no value
+    together: bool = False  # ``measure`` gets the pairs of all motions of a clip in a list, not one pair
 
 
-class Figure(NamedTuple):
-    """value: the figure. clips, motions, values: how many went into it."""
+class Result(NamedTuple):
+    """The value of a metric, and how many clips, motions and per-motion values went into it."""
 
     value: float
     clips: int
@@ -70,186 +61,190 @@ class Figure(NamedTuple):
         return {"clips": self.clips, "motions": self.motions, "values": self.values}
 
 
-HANDS = "frames in which the reference has the acting hand"
+WHOLE = f"{HANDS}, all together"
 LIFTED = (
     f"frames in which the object is more than {1000 * LIFTED_M:g} mm above the table (3rd percentile of the true "
     "clip's lowest vertex)"
 )
 SCORED = f"{LIFTED}, and no hand capsule {1000 * LARGEST_PENETRATION_M:g} mm or more inside it"
 FORCES = "residual below 0.01, friction 0.35"
-CONTACT = "the contact stage's distance and points (its info.json)"
+CONTACT = "distance and points of the contact stage (its info.json)"
 MANIPNET = "ManipNet (Zhang et al. 2021), Sec. 8"
+LOWER_BOUND = f"{OWN}: lower bound, without hands"
+CHOSEN_LENGTHS = "all; only stores whose info has `length: own`"
 
 METRICS: tuple[Metric, ...] = (
     Metric(
-        "Motion", "joint_error_mm", "joint error of the best sample", "mm", "lower", motion.joint_error_mm,
-        "best of a clip's samples", HANDS,
-        "mean distance of 21 joints (MPJPE), best of several samples as in Petrovich et al. 2022 (TEMOS), Sec. 4",
-        aligned=True,
+        "joint_error_mm", motion.joint_error_mm, topic="Motion", title="joint error of the best sample", unit="mm",
+        direction="lower", reduction="best of a clip's samples", aligned=True,
+        source="mean distance of 21 joints (MPJPE), best of samples as in Petrovich et al. 2022 (TEMOS), Sec. 4",
     ),
     Metric(
-        "Contact", "contact_f1", "F1 of the contact map made", "", "higher", touch.contact_f1,
-        "mean over motions", f"{HANDS}, all of them together", "Text2HOI (Cha et al. 2024), Sec. 3.2.2: the map",
-        thresholds=CONTACT,
+        "contact_f1", touch.contact_f1, topic="Contact", title="F1 of the contact map", direction="higher",
+        frames=WHOLE, thresholds=CONTACT, source="Text2HOI (Cha et al. 2024), Sec. 3.2.2: the map",
     ),
     Metric(
-        "Contact", "contact_precision", "precision of the contact map made", "", "higher", touch.contact_precision,
-        "mean over motions", f"{HANDS}, all of them together", "this project: half of `contact_f1`",
-        thresholds=CONTACT,
+        "contact_precision", touch.contact_precision, topic="Contact", title="precision of the contact map",
+        direction="higher", frames=WHOLE, thresholds=CONTACT, source=f"{OWN}: component of `contact_f1`",
     ),
     Metric(
-        "Contact", "contact_recall", "recall of the contact map made", "", "higher", touch.contact_recall,
-        "mean over motions", f"{HANDS}, all of them together", "this project: the other half of `contact_f1`",
-        thresholds=CONTACT,
+        "contact_recall", touch.contact_recall, topic="Contact", title="recall of the contact map",
+        direction="higher", frames=WHOLE, thresholds=CONTACT, source=f"{OWN}: component of `contact_f1`",
     ),
     Metric(
-        "Contact", "adherence", "F1 of the contact map asked for and the one made", "", "higher", touch.adherence,
-        "mean over motions", f"{HANDS}, all of them together", "this project: `asked.npz` beside the clips",
-        thresholds=CONTACT,
+        "adherence", touch.adherence, topic="Contact", title="F1 of the target and the generated contact map",
+        direction="higher", frames=WHOLE, thresholds=CONTACT, source=f"{OWN}: `asked.npz` next to the clips",
     ),
     Metric(
-        "Contact", "contact_distance_mm", "distance of joints that touch in the truth", "mm", "nearer the truth",
-        touch.contact_distance_mm, "mean over motions", f"{HANDS} and a joint touches in the true clip",
-        "this project; Text2HOI Sec. 3.5 refines it", every=3, samples=2, thresholds=CONTACT, aligned=True,
+        "contact_distance_mm", touch.contact_distance_mm, topic="Contact", unit="mm", direction="closer to recorded",
+        title="distance to the object of joints that touch it in the recording", aligned=True,
+        frames=f"{HANDS} and a joint touches in the true clip", frame_step=3, samples=2, thresholds=CONTACT,
+        source=f"{OWN}; Text2HOI Sec. 3.5 refines it",
     ),
     Metric(
-        "Physics", "penetration_mm", "penetration", "mm", "lower", touch.penetration_mm, "mean over motions", HANDS,
-        "depth of the deepest of 778 vertices inside the exact solid (GrabNet, Taheri et al. 2020, Sec. 5)",
-        every=3, samples=2,
+        "penetration_mm", touch.penetration_mm, topic="Physics", title="penetration depth", unit="mm",
+        direction="lower", frame_step=3, samples=2,
+        source="depth of the deepest of 778 vertices inside the exact solid (GrabNet, Taheri et al. 2020, Sec. 5)",
     ),
     Metric(
-        "Physics", "deep_share", f"share of frames deeper than {touch.DEEP_MM:g} mm", "", "lower", touch.deep_share,
-        "mean over motions", HANDS, "this project", every=3, samples=2, thresholds=f"{touch.DEEP_MM:g} mm",
+        "deep_share", touch.deep_share, topic="Physics", title=f"fraction of frames deeper than {touch.DEEP_MM:g} mm",
+        direction="lower", frame_step=3, samples=2, thresholds=f"{touch.DEEP_MM:g} mm",
     ),
     Metric(
-        "Physics", "penetration_volume_cm3", "volume that hand and object share",
-        "cm3", "lower", touch.penetration_volume_cm3,
-        "mean over motions", HANDS, "DiffH2O (Christen et al. 2024), intersection volume; of solids, not voxels",
-        every=3, samples=2, thresholds=f"lines {1000 * touch.CELL_M:g} mm apart",
+        "penetration_volume_cm3", touch.penetration_volume_cm3, topic="Physics", unit="cm3", direction="lower",
+        title="intersection volume of hand and object", frame_step=3, samples=2,
+        thresholds=f"lines {1000 * touch.CELL_M:g} mm apart",
+        source="DiffH2O (Christen et al. 2024), intersection volume; of solids, not voxels",
     ),
     Metric(
-        "Physics", "hand_hand_mm", "penetration of one hand by the other", "mm", "lower", touch.hand_hand_mm,
-        "mean over motions", f"{HANDS}, both hands", "this project: depth of the deepest of 19 x 19 capsules",
-        every=3, samples=2,
+        "hand_hand_mm", touch.hand_hand_mm, topic="Physics", title="penetration depth of one hand in the other",
+        unit="mm", direction="lower", frames=f"{HANDS}, both hands", frame_step=3, samples=2,
+        source=f"{OWN}: depth of the deepest of 19 x 19 capsules",
     ),
     Metric(
-        "Physics", "slip_cm_s", "slip of touching joints on the moving object", "cm/s", "lower", touch.slip_cm_s,
-        "mean over motions", f"{HANDS}, a joint touches in two in a row, and the part under it moves",
-        "this project: speed in the frame of the part touched",
-        thresholds=f"{CONTACT}; moving: {MOVING_CM_S:g} cm/s",
+        "slip_cm_s", touch.slip_cm_s, topic="Physics", title="slip of touching joints on the moving object",
+        unit="cm/s", direction="lower", thresholds=f"{CONTACT}; moving: {MOVING_CM_S:g} cm/s",
+        frames=f"{HANDS}, a joint touches in two in a row, and the part under it moves",
+        source=f"{OWN}: speed in the frame of the touched part",
     ),
     Metric(
-        "Physics", "realism_si", "physical realism, SI", "", "higher", motion.realism_si, "mean over frames", SCORED,
-        f"{MANIPNET} and Appendix A, in SI units", samples=1, thresholds=FORCES,
+        "realism_si", motion.realism_si, topic="Physics", title="physical realism, SI", direction="higher",
+        reduction="mean over frames", frames=SCORED, samples=1, thresholds=FORCES,
+        source=f"{MANIPNET} and Appendix A, in SI units",
     ),
     Metric(
-        "Physics", "realism_si_floor", "physical realism, SI, without hands", "", "nearer the truth", motion.floor_si,
-        "mean over frames", LIFTED, "this project: what the metric gives for nothing", samples=1, thresholds=FORCES,
-        floor_of="realism_si",
+        "realism_si_floor", motion.floor_si, topic="Physics", title="physical realism, SI, without hands",
+        direction="closer to recorded", reduction="mean over frames", frames=LIFTED, samples=1, thresholds=FORCES,
+        source=LOWER_BOUND, floor_of="realism_si",
     ),
     Metric(
-        "Physics", "realism_released", "physical realism, as released", "", "higher", motion.realism_as_released,
-        "mean over frames", SCORED, f"{MANIPNET} and Appendix A, units of the released sources", samples=1,
-        thresholds=FORCES,
+        "realism_released", motion.realism_as_released, topic="Physics", title="physical realism, as released",
+        direction="higher", reduction="mean over frames", frames=SCORED, samples=1, thresholds=FORCES,
+        source=f"{MANIPNET} and Appendix A, units of the released code",
     ),
     Metric(
-        "Physics", "realism_released_floor", "physical realism, as released, without hands", "", "nearer the truth",
-        motion.floor_as_released, "mean over frames", LIFTED, "this project: what the metric gives for nothing",
-        samples=1, thresholds=FORCES, floor_of="realism_released",
+        "realism_released_floor", motion.floor_as_released, topic="Physics",
+        title="physical realism, as released, without hands", direction="closer to recorded",
+        reduction="mean over frames", frames=LIFTED, samples=1, thresholds=FORCES, source=LOWER_BOUND,
+        floor_of="realism_released",
     ),
     Metric(
-        "Physics", "capsule_depth_mm", "penetration of overlapping capsules", "mm", "lower", motion.capsule_depth_mm,
-        "mean over motions", LIFTED, f"{MANIPNET}, penetration depth", samples=1,
+        "capsule_depth_mm", motion.capsule_depth_mm, topic="Physics", title="penetration depth of hand capsules",
+        unit="mm", direction="lower", frames=LIFTED, samples=1, source=f"{MANIPNET}, penetration depth",
     ),
     Metric(
-        "Motion", "smoothness_m_s2", "acceleration of joints in the wrist's frame", "m/s2", "nearer the truth",
-        motion.smoothness, "mean over motions", f"{HANDS}, three in a row", f"{MANIPNET}, smoothness",
+        "smoothness_m_s2", motion.smoothness, topic="Motion", title="acceleration of joints in the wrist's frame",
+        unit="m/s2", direction="closer to recorded", frames=f"{HANDS}, three in a row",
+        source=f"{MANIPNET}, smoothness",
     ),
     Metric(
-        "Motion", "jitter_m_s3", "jitter of joints in the world", "m/s3", "nearer the truth", motion.jitter_m_s3,
-        "mean over motions", f"{HANDS}, four in a row", "mean jerk, TransPose (Yi et al. 2021), Sec. 5.2",
+        "jitter_m_s3", motion.jitter_m_s3, topic="Motion", title="jitter of joints in the world", unit="m/s3",
+        direction="closer to recorded", frames=f"{HANDS}, four in a row",
+        source="mean jerk, TransPose (Yi et al. 2021), Sec. 5.2",
     ),
     Metric(
-        "Motion", "object_jitter_m_s3", "jitter of the object's middle in the world", "m/s3", "nearer the truth",
-        motion.object_jitter_m_s3, "mean over motions", "all, four in a row",
-        "this project: mean jerk, as `jitter_m_s3`",
+        "object_jitter_m_s3", motion.object_jitter_m_s3, topic="Motion", unit="m/s3",
+        title="jitter of the object's centre in the world", direction="closer to recorded",
+        frames="all, four in a row", source=f"{OWN}: mean jerk, as `jitter_m_s3`",
     ),
     Metric(
-        "Action", "action_followed", "the object does what the verb says", "", "higher", motion.action_followed,
-        "mean over motions", "all", "this project: limits of height, way, tilt, hinge and hands (`hoidata/actions`)",
-        thresholds="`actions.toml`, or the verb's own training clips: 1st to 99th percentile and half a deviation",
+        "action_followed", motion.action_followed, topic="Action", title="rule-based verb success",
+        direction="higher", frames="all",
+        thresholds="`actions.toml`, or training clips of the verb: 1st to 99th percentile and half a deviation",
+        source=f"{OWN}: limits of height, path, tilt, hinge and hands (`hoidata/actions`)",
     ),
     Metric(
-        "Action", "action_named", "the object moves most like the verb's training clips",
-        "", "higher", motion.action_named,
-        "mean over motions", "all", "this project: nearest centroid of the standardised numbers of `hoidata/actions`",
+        "action_named", motion.action_named, topic="Action", title="nearest-centroid verb accuracy",
+        direction="higher", frames="all",
+        source=f"{OWN}: nearest centroid of the standardised motion measures of `hoidata/actions`",
     ),
     Metric(
-        "Motion", "length_error_frames", "error of the length a family chose",
-        "frames", "lower", motion.length_error_frames,
-        "mean over motions", "all; only stores whose info says `length: own`", "this project",
+        "length_error_frames", motion.length_error_frames, topic="Motion", title="error of the estimated length",
+        unit="frames", direction="lower", frames=CHOSEN_LENGTHS,
     ),
     Metric(
-        "Motion", "length_error_share", "error of the length a family chose, of the true one", "", "lower",
-        motion.length_error_share, "mean over motions", "all; only stores whose info says `length: own`",
-        "this project",
+        "length_error_share", motion.length_error_share, topic="Motion",
+        title="relative error of the estimated length", direction="lower", frames=CHOSEN_LENGTHS,
     ),
 )  # fmt: skip
 
 
 def metric(name: str) -> Metric:
-    """The metric of that name. Raises KeyError that lists the names there are."""
-    found = next((item for item in METRICS if item.name == name), None)
-    if found is None:
+    """The metric of that name. Raises KeyError that lists the registered names."""
+    named = next((item for item in METRICS if item.name == name), None)
+    if named is None:
         raise KeyError(f"no metric {name!r}; there are: {', '.join(item.name for item in METRICS)}")
-    return found
+    return named
 
 
-def reduced(metric: Metric, clips: list[list[Values]]) -> Figure | None:
-    """One figure of the values of every motion, by clip and sample; None where no motion has a value.
+def summarise(metric: Metric, clips: list[list[Values]]) -> Result | None:
+    """Reduce the values of all motions to one result; None if no motion has a value.
 
-    Motions without values are left out, not counted as 0; ``unmeasured`` counts them.
+    Motions without values are skipped, not counted as 0; ``count_unmeasured`` counts them.
+
+    Args:
+        clips: the values of every motion, by clip and sample.
     """
     motions = [_with_values(samples) for samples in clips]
     motions = [samples for samples in motions if samples]
     if not motions:
         return None
     means = [np.array([values.mean() for values in samples]) for samples in motions]
-    every = np.concatenate([values for samples in motions for values in samples])
+    all_values = np.concatenate([values for samples in motions for values in samples])
     if metric.reduction == "best of a clip's samples":
-        value = np.mean([found.max() if metric.direction == "higher" else found.min() for found in means])
+        value = np.mean([clip.max() if metric.direction == "higher" else clip.min() for clip in means])
     else:
-        value = np.mean(every if metric.reduction == "mean over frames" else np.concatenate(means))
-    return Figure(float(value), len(motions), sum(map(len, means)), len(every))
+        value = np.mean(all_values if metric.reduction == "mean over frames" else np.concatenate(means))
+    return Result(float(value), len(motions), sum(map(len, means)), len(all_values))
 
 
-def unmeasured(metric: Metric, clips: list[list[Values]]) -> dict[str, int]:
-    """How many clips no motion of which has a value, by the reason that the first motion has."""
-    return counted(_why_none(metric, samples) for samples in clips if not _with_values(samples))
+def count_unmeasured(metric: Metric, clips: list[list[Values]]) -> dict[str, int]:
+    """The number of clips without any value, by the reason of their first motion."""
+    return counted(_reason(metric, samples) for samples in clips if not _with_values(samples))
 
 
 def _with_values(samples: list[Values]) -> list[np.ndarray]:
     return [values for values in samples if isinstance(values, np.ndarray) and len(values)]
 
 
-def _why_none(metric: Metric, samples: list[Values]) -> str:
+def _reason(metric: Metric, samples: list[Values]) -> str:
     reasons = [values.reason for values in samples if isinstance(values, Unmeasured)]
     return reasons[0] if reasons else f"no such frame: {metric.frames}"
 
 
 def sum_and_count(metric: Metric, samples: list[Values]) -> tuple[float, int]:
-    """What one clip brings to a figure: sums over all clips, divided by counts, are the figure."""
-    known = _with_values(samples)
+    """One clip's share of a result: the sums of all clips divided by their counts are the result."""
+    measured = _with_values(samples)
     if metric.reduction == "mean over frames":
-        return float(sum(values.sum() for values in known)), sum(map(len, known))
-    means = [float(values.mean()) for values in known]
+        return float(sum(values.sum() for values in measured)), sum(map(len, measured))
+    means = [float(values.mean()) for values in measured]
     if metric.reduction == "best of a clip's samples" and means:
         means = [max(means) if metric.direction == "higher" else min(means)]
     return sum(means), len(means)
 
 
-class Judged(Protocol):
-    """What telling the better of two figures needs of a metric of either list."""
+class Ranked(Protocol):
+    """The fields of a metric, geometric or of features, that ``is_better`` reads."""
 
     @property
     def direction(self) -> Direction: ...
@@ -257,10 +252,14 @@ class Judged(Protocol):
     def floor_of(self) -> str: ...
 
 
-def is_better(metric: Judged, value: float, other: float, truth: float | None) -> bool | None:
-    """Whether ``value`` is better than ``other``; None where the truth is not known or the metric is a floor."""
+def is_better(metric: Ranked, value: float, other: float, recorded: float | None) -> bool | None:
+    """Whether ``value`` is better than ``other``; None for lower bounds and if a needed recorded value is missing.
+
+    Args:
+        recorded: the value of the recorded clips, None if they were not measured.
+    """
     if metric.floor_of:
         return None
-    if metric.direction == "nearer the truth":
-        return None if truth is None else abs(value - truth) < abs(other - truth)
+    if metric.direction == "closer to recorded":
+        return None if recorded is None else abs(value - recorded) < abs(other - recorded)
     return value > other if metric.direction == "higher" else value < other

@@ -187,11 +187,12 @@ def handled_objects(keys: Iterable[str]) -> list[str]:
 
 
 def _by_object(clips: pd.DataFrame, rule: SplitRule) -> list[Part | None]:
-    listed = _listed_parts(rule)
+    listed: dict[str, Part | None] = {**_listed_parts(rule)}
     parts: list[Part | None] = []
     for name, others in zip(clips["object"], clips["other_objects"], strict=True):
         handled = [object_name(name), *handled_objects(others)]
-        object_parts: set[Part | None] = {listed.get(key, _unlisted_part(rule)) for key in handled}
+        object_parts: set[Part | None] = set()
+        object_parts.update(listed.get(key, _unlisted_part(rule)) for key in handled)
         parts.append(object_parts.pop() if len(object_parts) == 1 else None)
     return parts
 

@@ -1,4 +1,7 @@
-"""The recorded clip with one thing spoilt, as families: a figure that is as good as the truth's does not see that."""
+"""Negative controls: recorded clips with one property perturbed.
+
+A metric that is as good on a control as on the recorded clips is blind to the perturbed property.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -10,55 +13,57 @@ from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
 from hoidata.objects.model import articulate
 from hoidata.store.annotated import AnnotatedStore
 from models.baselines.families import GroundTruth
-from models.baselines.lookups import Lookup, lookup_clips, of_the_hand
-from models.common.family import EachAlone, Family, LeftOut
+from models.baselines.retrieval import Retrieval, of_the_hand, retrieval_clips
+from models.common.family import EachAlone, Family, LeftOut, Sources
 
 OBJECT_MOVED_M = 0.10
-# From a joint to a sampled point: 2 cm of air, and the finger around the joint.
+# From a joint to a sampled point: 2 cm of air plus the radius of a finger.
 HANDS_AWAY_M = 0.03
 PRESSED_M = 0.01
 PRESSED_DEEP_M = SHIFTED_M = 0.03
-# Of a wrist along each axis and of every angle: together 5 mm at a joint.
+# Standard deviation of the wrist along each axis and of every angle: together 5 mm at a joint.
 NOISE_WRIST_M, NOISE_RAD = 0.0018, 0.025
-FRAMES_LOOKED_AT = 8
+MOST_FRAMES_MEASURED = 8
 NEVER_TOUCHES = "its hands never touch the object in the frames asked for"
-WAYS = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], np.float64)
-WAYS /= np.linalg.norm(WAYS, axis=1, keepdims=True)
+DIRECTIONS = np.array(
+    [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], np.float64
+)
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True)
-class SpoiltTruth:
-    """The recorded clip after ``spoil``, which says in words where it cannot be. drawn: each motion is another."""
+class PerturbedRecording:
+    """Samples the recorded clip after ``perturb``."""
 
     truth: GroundTruth
-    spoil: Callable[[Clip, "Recording"], Clip | str]
-    drawn: bool
+    perturb: Callable[[Clip, "Recording"], Clip | str]  # returns the reason if a clip cannot be perturbed
+    differs_per_motion: bool  # the perturbation is random, with the seed of the motion
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
-        made = dict[str, Clip | str]()
+        perturbed = dict[str, Clip | str]()
         for request in requests:
             key = self._key(request)
-            if key not in made:
-                made[key] = self.spoil(self.truth.recorded(request), Recording(self.truth.annotated, request))
-        return [_answer(request, made[self._key(request)]) for request in requests]
+            if key not in perturbed:
+                perturbed[key] = self.perturb(self.truth.recorded(request), Recording(self.truth.annotated, request))
+        return [_answer(request, perturbed[self._key(request)]) for request in requests]
 
     def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip | LeftOut], list[np.ndarray]]:
         return self.sample(requests), self.truth.contact_maps(requests)
 
     def _key(self, request: Request) -> str:
-        return request.motion_id if self.drawn else request.clip_id
+        return request.motion_id if self.differs_per_motion else request.clip_id
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What is known of the clip whose place a motion takes."""
+    """The recorded clip of a request: contact, joints and random numbers for its perturbation."""
 
     annotated: AnnotatedStore
     request: Request
 
     @property
     def sides(self) -> list[Side]:
-        """The hands that are asked for; others are left alone."""
+        """The requested hands; the others are not perturbed."""
         return [side for side, active in zip(SIDES, self.request.active_hands, strict=True) if active]
 
     @property
@@ -66,7 +71,7 @@ class Recording:
         return np.random.default_rng(self.request.seed)
 
     def touching_frames(self, side: Side) -> np.ndarray:
-        """(frame,) in which a joint of the hand touches, of those asked for."""
+        """(frame,) requested frames in which a joint of the hand touches the object."""
         frames = np.unique(self.annotated.distances(self.request.clip_id, side).frame)
         return frames[frames < self.request.n_frames]
 
@@ -76,65 +81,65 @@ class Recording:
         return clip.object.take(frames).world_from_object.inverse() @ joints_m
 
 
-def _answer(request: Request, made: Clip | str) -> Clip | LeftOut:
+def _answer(request: Request, perturbed: Clip | str) -> Clip | LeftOut:
     motion_id = request.motion_id
-    return LeftOut(motion_id, made) if isinstance(made, str) else replace(made, clip_id=motion_id)
+    return LeftOut(motion_id, perturbed) if isinstance(perturbed, str) else replace(perturbed, clip_id=motion_id)
 
 
-def static(clip: Clip, known: Recording) -> Clip | str:
-    """Every frame is that of the first contact."""
-    touching = np.concatenate([known.touching_frames(side) for side in known.sides])
+def static(clip: Clip, recording: Recording) -> Clip | str:
+    """Repeat the frame of the first contact."""
+    touching = np.concatenate([recording.touching_frames(side) for side in recording.sides])
     return _frames(clip, np.full(clip.n_frames, touching.min())) if len(touching) else NEVER_TOUCHES
 
 
-def backwards(clip: Clip, known: Recording) -> Clip:
-    """The last frame first."""
+def backwards(clip: Clip, recording: Recording) -> Clip:
+    """Reverse the order of the frames."""
     return _frames(clip, np.arange(clip.n_frames)[::-1])
 
 
-def object_moved(clip: Clip, known: Recording) -> Clip:
-    """The object 10 cm to one side, another for each motion; the hands as recorded, to the bit."""
-    angle = known.draws.uniform(0, 2 * np.pi)
-    sideways = known.request.world_from_model[:3, :2] @ [np.cos(angle), np.sin(angle)]
+def object_moved(clip: Clip, recording: Recording) -> Clip:
+    """Shift the object by 10 cm in a random horizontal direction; the hands keep their exact values."""
+    angle = recording.draws.uniform(0, 2 * np.pi)
+    sideways = recording.request.world_from_model[:3, :2] @ [np.cos(angle), np.sin(angle)]
     moved = clip.object.translation_m + OBJECT_MOVED_M * sideways
     return replace(clip, object=replace(clip.object, translation_m=moved.astype(np.float32)))
 
 
-def hands_away(clip: Clip, known: Recording) -> Clip | str:
-    """Each hand held off the surface by 2 cm: moved with the object, as far as that takes in all frames it touches."""
-    return _with_hands(clip, {side: _held_off(clip, known, side) for side in known.sides})
+def hands_away(clip: Clip, recording: Recording) -> Clip | str:
+    """Keep each hand 2 cm off the surface: one shift in the object frame that clears all frames with contact."""
+    return _with_hands(clip, {side: _moved_off(clip, recording, side) for side in recording.sides})
 
 
-def pressed(clip: Clip, known: Recording, by_m: float = PRESSED_M) -> Clip | str:
-    """Each hand moved 1 cm into the object, against the surface at the point a joint comes nearest to."""
-    return _with_hands(clip, {side: _pressed_in(clip, known, side, by_m) for side in known.sides})
+def pressed(clip: Clip, recording: Recording, by_m: float = PRESSED_M) -> Clip | str:
+    """Move each hand 1 cm into the object, against the normal at the point closest to a joint."""
+    return _with_hands(clip, {side: _pressed_in(clip, recording, side, by_m) for side in recording.sides})
 
 
-def pressed_deep(clip: Clip, known: Recording) -> Clip | str:
-    """The same, 3 cm."""
-    return pressed(clip, known, PRESSED_DEEP_M)
+def pressed_deep(clip: Clip, recording: Recording) -> Clip | str:
+    """Move each hand 3 cm into the object."""
+    return pressed(clip, recording, PRESSED_DEEP_M)
 
 
-def hands_still(clip: Clip, known: Recording) -> Clip | str:
-    """Each hand as it is at its first contact; the object moves as recorded."""
+def hands_still(clip: Clip, recording: Recording) -> Clip | str:
+    """Freeze each hand at its first contact; the object moves as recorded."""
     tracks: dict[Side, HandTrack | None] = {}
-    for side in known.sides:
-        touching, track = known.touching_frames(side), clip.hands[side]
+    for side in recording.sides:
+        touching, track = recording.touching_frames(side), clip.hands[side]
         frames = np.full(clip.n_frames, touching[0]) if len(touching) else None
-        tracks[side] = None if frames is None else track.take(_seen(track.valid, frames))
+        tracks[side] = None if frames is None else track.take(_nearest_valid(track.valid, frames))
     return _with_hands(clip, tracks)
 
 
-def hands_shifted(clip: Clip, known: Recording) -> Clip:
-    """Each hand 3 cm along an axis of the object or against it, another for each motion: the whole recording long."""
-    ways = np.concatenate((np.eye(3), -np.eye(3)))
-    by_m = clip.object.world_from_object.rotation @ (SHIFTED_M * known.draws.choice(ways))
-    return replace(clip, hands={**clip.hands, **{side: _shifted(clip.hands[side], by_m) for side in known.sides}})
+def hands_shifted(clip: Clip, recording: Recording) -> Clip:
+    """Shift each hand by 3 cm along a random positive or negative object axis, constant over the clip."""
+    axes = np.concatenate((np.eye(3), -np.eye(3)))
+    by_m = clip.object.world_from_object.rotation @ (SHIFTED_M * recording.draws.choice(axes))
+    return replace(clip, hands={**clip.hands, **{side: _shifted(clip.hands[side], by_m) for side in recording.sides}})
 
 
-def noisy(clip: Clip, known: Recording) -> Clip:
-    """Noise on the wrist and every angle of each hand in every frame, about 5 mm at a joint."""
-    draws = known.draws
+def noisy(clip: Clip, recording: Recording) -> Clip:
+    """Add noise to the wrist and every angle of each hand in every frame, about 5 mm at a joint."""
+    draws = recording.draws
 
     def shaken(track: HandTrack) -> HandTrack:
         def noise(values: np.ndarray, spread: float) -> np.ndarray:
@@ -147,69 +152,71 @@ def noisy(clip: Clip, known: Recording) -> Clip:
             hand_pose=noise(track.hand_pose, NOISE_RAD),
         )
 
-    return replace(clip, hands={**clip.hands, **{side: shaken(clip.hands[side]) for side in known.sides}})
+    return replace(clip, hands={**clip.hands, **{side: shaken(clip.hands[side]) for side in recording.sides}})
 
 
 @dataclass(frozen=True)
 class OtherHands(EachAlone):
-    """The object as recorded, with the hands of a training clip."""
+    """Combines the recorded object motion with the hands of a retrieved training clip."""
 
     truth: GroundTruth
-    lookup: Lookup
+    retrieval: Retrieval
 
     def motion(self, request: Request) -> Clip | LeftOut:
-        found = self.lookup.motion(request)
-        return found if isinstance(found, LeftOut) else replace(found, object=self.truth.recorded(request).object)
+        retrieved = self.retrieval.motion(request)
+        if isinstance(retrieved, LeftOut):
+            return retrieved
+        return replace(retrieved, object=self.truth.recorded(request).object)
 
 
-def _frames(clip: Clip, rows: np.ndarray) -> Clip:
-    """Other frames of the clip in the place of its own; a hand is taken from the nearest frame in which it is seen."""
-    hands = {side: track.take(_seen(track.valid, rows)) for side, track in clip.hands.items()}
-    return replace(clip, hands=hands, object=clip.object.take(rows))
+def _frames(clip: Clip, frames: np.ndarray) -> Clip:
+    """The clip with frames reordered; a hand is taken from the nearest frame in which it is valid."""
+    hands = {side: track.take(_nearest_valid(track.valid, frames)) for side, track in clip.hands.items()}
+    return replace(clip, hands=hands, object=clip.object.take(frames))
 
 
-def _seen(valid: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    there = np.flatnonzero(valid)
-    return there[abs(rows[:, None] - there).argmin(axis=1)] if len(there) else rows
+def _nearest_valid(valid: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    valid_frames = np.flatnonzero(valid)
+    return valid_frames[abs(frames[:, None] - valid_frames).argmin(axis=1)] if len(valid_frames) else frames
 
 
 def _with_hands(clip: Clip, tracks: dict[Side, HandTrack | None]) -> Clip | str:
-    """The clip with the tracks that are given; why not, where there is none."""
+    """The clip with the tracks that are not None replaced; the reason if there is none."""
     moved = {side: track for side, track in tracks.items() if track is not None}
     return replace(clip, hands={**clip.hands, **moved}) if moved else NEVER_TOUCHES
 
 
-def _held_off(clip: Clip, known: Recording, side: Side) -> HandTrack | None:
-    touching = known.touching_frames(side)
+def _moved_off(clip: Clip, recording: Recording, side: Side) -> HandTrack | None:
+    touching = recording.touching_frames(side)
     if not len(touching):
         return None
-    frames = touching[np.linspace(0, len(touching) - 1, min(FRAMES_LOOKED_AT, len(touching))).astype(int)]
-    points, thing = known.request.points, clip.object.take(frames)
-    placed = articulate(points.points_m.astype(np.float64), points.part, thing.model.hinge, thing.hinge_rad)
-    apart = known.joints_in_object(clip, side, frames)[:, :, None] - placed[:, None]
-    shift = _shortest_way_out(apart.reshape(-1, 3), HANDS_AWAY_M)
+    frames = touching[np.linspace(0, len(touching) - 1, min(MOST_FRAMES_MEASURED, len(touching))).astype(int)]
+    points, track = recording.request.points, clip.object.take(frames)
+    points_m = articulate(points.points_m.astype(np.float64), points.part, track.model.hinge, track.hinge_rad)
+    joints_from_points = recording.joints_in_object(clip, side, frames)[:, :, None] - points_m[:, None]
+    shift = _shortest_clearing_move(joints_from_points.reshape(-1, 3), HANDS_AWAY_M)
     return _shifted(clip.hands[side], clip.object.world_from_object.rotation @ shift)
 
 
-def _shortest_way_out(apart: np.ndarray, clear_m: float) -> np.ndarray:
-    """(3,) the shortest of the moves along 26 ways after which all of ``apart (n, 3)`` are ``clear_m`` long or longer.
+def _shortest_clearing_move(offsets: np.ndarray, clear_m: float) -> np.ndarray:
+    """(3,) the shortest shift along one of 26 directions after which all ``offsets`` (n, 3) have length >= ``clear_m``.
 
-    v + d u is as long as that at the roots of d^2 + 2 d (v.u) + v.v = clear^2, and longer beyond the larger one.
+    |v + d u| = clear at the roots of d^2 + 2 d (v.u) + v.v = clear^2, and |v + d u| grows beyond the larger root.
     """
-    along = apart @ WAYS.T
-    inside = along**2 + clear_m**2 - (apart**2).sum(axis=1)[:, None]
-    far = np.where(inside > 0, np.sqrt(np.maximum(inside, 0)) - along, 0.0).max(axis=0)
-    return far.min() * WAYS[far.argmin()]
+    along_direction = offsets @ DIRECTIONS.T
+    inside = along_direction**2 + clear_m**2 - (offsets**2).sum(axis=1)[:, None]
+    distance = np.where(inside > 0, np.sqrt(np.maximum(inside, 0)) - along_direction, 0.0).max(axis=0)
+    return distance.min() * DIRECTIONS[distance.argmin()]
 
 
-def _pressed_in(clip: Clip, known: Recording, side: Side, by_m: float) -> HandTrack | None:
-    entries = known.annotated.distances(known.request.clip_id, side).window(0, clip.n_frames)
+def _pressed_in(clip: Clip, recording: Recording, side: Side, by_m: float) -> HandTrack | None:
+    entries = recording.annotated.distances(recording.request.clip_id, side).window(0, clip.n_frames)
     if not len(entries.frame):
         return None
-    points, nearest = known.request.points, entries.point[entries.distance_m.argmin()]
+    points, nearest = recording.request.points, entries.point[entries.distance_m.argmin()]
     ends = points.points_m[nearest] + np.outer((0.0, 1.0), points.normals[nearest])
-    placed = clip.object.points_in_world(ends.astype(np.float64), np.repeat(points.part[nearest], 2))
-    return _shifted(clip.hands[side], -by_m * (placed[:, 1] - placed[:, 0]))
+    normal_ends = clip.object.points_in_world(ends.astype(np.float64), np.repeat(points.part[nearest], 2))
+    return _shifted(clip.hands[side], -by_m * (normal_ends[:, 1] - normal_ends[:, 0]))
 
 
 def _shifted(track: HandTrack, by_m: np.ndarray) -> HandTrack:
@@ -217,23 +224,28 @@ def _shifted(track: HandTrack, by_m: np.ndarray) -> HandTrack:
     return replace(track, wrist_m=(track.wrist_m + by_m).astype(np.float32))
 
 
-def _spoilt(name: str, title: str, spoil: Callable[[Clip, Recording], Clip | str], drawn: bool = False) -> Family:
-    return Family(name, title, lambda sources: SpoiltTruth(GroundTruth(sources.annotated), spoil, drawn))
+def _control(
+    name: str, title: str, perturb: Callable[[Clip, Recording], Clip | str], differs_per_motion: bool = False
+) -> Family:
+    def load(sources: Sources) -> PerturbedRecording:
+        return PerturbedRecording(GroundTruth(sources.annotated), perturb, differs_per_motion)
+
+    return Family(name, title, load)
 
 
-STATIC = _spoilt("static", "truth held at its first contact", static)
-REVERSED = _spoilt("reversed", "truth backwards", backwards)
-OBJECT_MOVED = _spoilt("object-moved", "truth, object 10 cm away", object_moved, drawn=True)
-HANDS_AWAY = _spoilt("hands-away", "truth, hands 2 cm off", hands_away)
-PRESSED = _spoilt("pressed", "truth, hands 1 cm in", pressed)
-PRESSED_DEEP = _spoilt("pressed-deep", "truth, hands 3 cm in", pressed_deep)
-HANDS_STILL = _spoilt("hands-still", "truth, hands held still", hands_still)
-HANDS_SHIFTED = _spoilt("hands-shifted", "truth, hands 3 cm to one side", hands_shifted, drawn=True)
-NOISE = _spoilt("noise", "truth with 5 mm of noise", noisy, drawn=True)
+STATIC = _control("static", "recorded, frozen at the first contact", static)
+REVERSED = _control("reversed", "recorded, backwards", backwards)
+OBJECT_MOVED = _control("object-moved", "recorded, object 10 cm away", object_moved, differs_per_motion=True)
+HANDS_AWAY = _control("hands-away", "recorded, hands 2 cm off the surface", hands_away)
+PRESSED = _control("pressed", "recorded, hands 1 cm inside", pressed)
+PRESSED_DEEP = _control("pressed-deep", "recorded, hands 3 cm inside", pressed_deep)
+HANDS_STILL = _control("hands-still", "recorded, hands frozen", hands_still)
+HANDS_SHIFTED = _control("hands-shifted", "recorded, hands 3 cm to one side", hands_shifted, differs_per_motion=True)
+NOISE = _control("noise", "recorded, with 5 mm of noise", noisy, differs_per_motion=True)
 OTHER_HANDS = Family(
     "other-hands",
-    "truth, hands of another clip",
+    "recorded, hands of another clip",
     lambda sources: OtherHands(
-        GroundTruth(sources.annotated), Lookup(lookup_clips(sources), of_the_hand, "of this hand")
+        GroundTruth(sources.annotated), Retrieval(retrieval_clips(sources), of_the_hand, "of this hand")
     ),
 )

@@ -1,4 +1,4 @@
-"""Rivals as families: the recorded clip itself, mean pose, mean motion."""
+"""Baselines: the recorded clip itself, the mean pose and the mean motion of the training clips."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from hoidata.store.annotated import AnnotatedStore
-from models.baselines.lookups import matched_rows, train_clips
+from models.baselines.retrieval import matched_rows, train_clips
 from models.common.family import EachAlone, Family, LeftOut, motion_clip
 from models.common.features import proper_hands, proper_object
 
@@ -21,7 +21,7 @@ NO_MEAN = "no training clip in which a hand asked for acts"
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """The recorded clip whose place the motion takes."""
+    """Answers every request with its recorded clip."""
 
     annotated: AnnotatedStore
 
@@ -32,7 +32,7 @@ class GroundTruth:
         return self.sample(requests), self.contact_maps(requests)
 
     def contact_maps(self, requests: Sequence[Request]) -> list[np.ndarray]:
-        """(point,) bool: what the hands asked for touch in the recorded clips, in the frames asked for."""
+        """Per request, (point,) bool: the points that requested hands touch in requested frames of the recording."""
         maps = []
         for request in requests:
             near = self.annotated.distances(request.clip_id).window(0, request.n_frames)
@@ -42,44 +42,45 @@ class GroundTruth:
         return maps
 
     def recorded(self, request: Request) -> Clip:
-        """The recorded clip under the name and with the frames that are asked for."""
+        """The recorded clip with the requested frames and the id of the motion."""
         clip = self.annotated.clip(request.clip_id).take(slice(0, request.n_frames))
         return replace(clip, clip_id=request.motion_id, other_objects=(), camera=None, body=None, source_contact=None)
 
 
 @dataclass(frozen=True)
 class MeanMotion(EachAlone):
-    """The mean of the training clips, over equal intervals of each clip's own time.
+    """The mean of the training clips per bin of normalised time; one bin gives the mean pose."""
 
-    hands (2, bin, 99), objects (bin, 10): features in the model frame; one bin is the mean pose. seen: (2,) bool, the
-    hands that act in a training clip; the others have no mean.
-    """
-
-    hands: np.ndarray
-    objects: np.ndarray
+    hands: np.ndarray  # (2, bin, 99) features in the model frame
+    objects: np.ndarray  # (bin, 10) features in the model frame
     synthetic: bool
-    seen: np.ndarray
+    has_mean: np.ndarray  # (2,) bool, the hands that act in a training clip
 
     @classmethod
     def of(cls, train: Sequence[ClipSample], bins: int) -> "MeanMotion":
-        """From training clips; frames of a hand that takes no part are left out."""
+        """Average training clips; frames of a hand that does not act are skipped."""
         hands, objects = np.zeros((2, bins, HAND_FEATURES)), np.zeros((bins, OBJECT_FEATURES))
-        n_hands, n_objects = np.zeros((2, bins, 1)), np.zeros((bins, 1))
+        hand_weights, object_weights = np.zeros((2, bins, 1)), np.zeros((bins, 1))
         for sample in train:
-            # Clip and bins divide the same time: every frame counts in a bin by how long it lies in it.
+            # Resample clip and bins to their common multiple, so that a frame counts in a bin by its overlap.
             moments = np.arange(sample.length * bins)
-            frames, rows = moments // bins, moments // sample.length
-            np.add.at(objects, rows, sample.object[frames])
-            np.add.at(n_objects, rows, 1.0)
+            frames, bins_of_moments = moments // bins, moments // sample.length
+            np.add.at(objects, bins_of_moments, sample.object[frames])
+            np.add.at(object_weights, bins_of_moments, 1.0)
             for side in range(2):
-                there = (sample.valid[side] & sample.active_hands[side])[frames]
-                np.add.at(hands[side], rows[there], sample.hands[side][frames[there]])
-                np.add.at(n_hands[side], rows[there], 1.0)
+                active = (sample.valid[side] & sample.active_hands[side])[frames]
+                np.add.at(hands[side], bins_of_moments[active], sample.hands[side][frames[active]])
+                np.add.at(hand_weights[side], bins_of_moments[active], 1.0)
         synthetic = any(sample.synthetic for sample in train)
-        return cls(_means(hands, n_hands), _means(objects, n_objects), synthetic, n_hands[:, :, 0].sum(axis=1) > 0)
+        return cls(
+            _means(hands, hand_weights),
+            _means(objects, object_weights),
+            synthetic,
+            hand_weights[:, :, 0].sum(axis=1) > 0,
+        )
 
     def motion(self, request: Request) -> Clip | LeftOut:
-        if (request.active_hands & ~self.seen).any():
+        if (request.active_hands & ~self.has_mean).any():
             return LeftOut(request.motion_id, NO_MEAN)
         rows = matched_rows(request.n_frames, len(self.objects))
         hands, objects = torch.from_numpy(self.hands[:, rows]), torch.from_numpy(self.objects[rows])
@@ -87,7 +88,7 @@ class MeanMotion(EachAlone):
 
 
 def _means(total: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Sums (..., bin, D) over counts (..., bin, 1); bins without any get the mean of all, or no motion at all."""
+    """Sums (..., bin, D) over counts (..., bin, 1); empty bins get the overall mean, without any the identity pose."""
     overall = total.sum(-2, keepdims=True) / np.maximum(count.sum(-2, keepdims=True), 1)
     means = np.where(count > 0, total / np.maximum(count, 1), overall)
     unturned = np.zeros(total.shape[-1])

@@ -16,7 +16,7 @@ from hoidata.clips.features import GLOBAL_ORIENT_6D, HAND_FEATURES
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import HandPair
 from hoidata.hands.model import N_VERTICES
-from hoidata.metrics.asked import AskedDistances
+from hoidata.metrics.target_contact import AskedDistances
 from hoidata.refinement import GeneratedHand, RefinementSettings, fit_hands, refine_hands
 from hoidata.sensors.part_bps import distance_map
 from hoidata.settings import build_config

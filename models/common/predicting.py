@@ -18,7 +18,7 @@ from hoidata.clips.clip import Clip
 from hoidata.clips.features import GLOBAL_ORIENT_6D
 from hoidata.files import atomic_folder, write_whole
 from hoidata.hands import HandPair
-from hoidata.metrics.asked import AskedDistances, write_asked, write_asked_distances
+from hoidata.metrics.target_contact import AskedDistances, write_asked, write_asked_distances
 from hoidata.settings import at_least, build_config
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import write_store
@@ -71,8 +71,8 @@ def sample_family(
 
     Writes ``out/clips`` and ``out/diagnostics.json``, or ``out/empty.json`` with the reason. Skipped requests are
     listed in ``out/left_out.json``. A family that is :class:`ReportsContact` also gets ``out/asked.npz`` or
-    ``out/asked-distances.npz`` (``hoidata.metrics.asked``). Motion k for a clip is named ``<clip id>~<k>``. Length and
-    hand type are those of the recorded clip; of a clip that is too long, the first frames count.
+    ``out/asked-distances.npz`` (``hoidata.metrics.target_contact``). Motion k for a clip is named ``<clip id>~<k>``.
+    Length and hand type are those of the recorded clip; of a clip that is too long, the first frames count.
 
     Args:
         annotated_root: folder with clips, annotation, contact and splits of a dataset.

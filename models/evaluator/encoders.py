@@ -1,4 +1,4 @@
-"""The trained evaluator of a dataset, ready for ``evaluate_store``: weights and what they are called by."""
+"""Loads the trained evaluator networks of a dataset as encoders for ``evaluate_store``."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from models.evaluator.networks import EncoderConfig, MotionEncoder
 
 @dataclass(frozen=True)
 class MotionEvaluator:
-    """One network as ``hoidata.metrics.encoded.Encoder``."""
+    """A trained network as ``hoidata.metrics.encoded.Encoder``."""
 
     name: str
     network: MotionEncoder
@@ -31,10 +31,10 @@ class MotionEvaluator:
 
     @torch.no_grad()
     def encode(self, motions: Sequence[Motion], sides: Sequence[tuple[Side, ...]]) -> Encoding:
-        """Features and logits; the pair encoder's features are of length one and it has no logits."""
-        planar = self.network.config.trunk == "planar"
-        found = [_planar(*own) if planar else corrected_input(*own) for own in zip(motions, sides, strict=True)]
-        feature, logits = self.network(*padded(found))
+        """Features and logits; the text-motion encoder has unit features and no logits."""
+        to_input = _planar if self.network.config.trunk == "planar" else corrected_input
+        inputs = [to_input(motion, acting) for motion, acting in zip(motions, sides, strict=True)]
+        feature, logits = self.network(*padded(inputs))
         if self.network.text is not None:
             feature, logits = nn.functional.normalize(logits, dim=-1), logits[:, :0]
         return Encoding(feature.double().numpy(), logits.double().numpy())
@@ -47,28 +47,28 @@ class MotionEvaluator:
 
 
 def load_evaluators(folder: str | Path) -> list[MotionEvaluator]:
-    """All networks below ``evaluators/<profile>/<dataset>``, by name; none where the evaluator is off or empty."""
+    """All networks below ``evaluators/<profile>/<dataset>`` in order of name; empty if the evaluator is off."""
     return [load_evaluator(path.parent) for path in sorted(Path(folder).glob(f"*/{FILE_NAME}"))]
 
 
 def load_evaluator(folder: Path) -> MotionEvaluator:
     """The network in ``folder``. Raises BadInput as ``load_checkpoint`` does."""
     checkpoint = load_checkpoint(folder, stored_network(folder.name))
-    assert isinstance(checkpoint.network, MotionEncoder)
-    return MotionEvaluator(
-        folder.name, checkpoint.network, tuple(checkpoint.facts["labels"]), weights_digest(checkpoint.network)
-    )
+    network = checkpoint.network
+    assert isinstance(network, MotionEncoder)
+    return MotionEvaluator(folder.name, network, tuple(checkpoint.facts["labels"]), weights_digest(network))
 
 
 def stored_network(name: str) -> StoredNetwork:
+    """How the checkpoint of an evaluator network is stored."""
     return StoredNetwork(f"evaluator-{name}", EncoderConfig, MotionEncoder)
 
 
 def weights_digest(network: MotionEncoder) -> str:
-    """SHA-256 of configuration and weights, whatever else stands in the file."""
+    """SHA-256 of configuration and weights, independent of the other contents of the checkpoint."""
     tensors = {name: tensor.contiguous() for name, tensor in sorted(network.state_dict().items())}
-    known = {name: sha256_bytes(tensor.numpy().tobytes()) for name, tensor in tensors.items()}
-    return sha256_bytes(canonical_json([plain_config(network.config), known]).encode())
+    digests = {name: sha256_bytes(tensor.numpy().tobytes()) for name, tensor in tensors.items()}
+    return sha256_bytes(canonical_json([plain_config(network.config), digests]).encode())
 
 
 def _planar(motion: Motion, sides: tuple[Side, ...]) -> np.ndarray:

@@ -1,7 +1,8 @@
-"""The networks of the evaluator: one class whose configuration chooses the trunk, and with it the input.
+"""Evaluator networks: one class whose configuration selects the trunk and its input.
 
-``planar`` is the classifier of IMoS (Ghosh et al. 2023) as Text2HOI takes it over: two planar views of the joints, a
-two-layer LSTM each. ``recurrent`` reads the object as well. With ``text`` the logits are a space shared with sentences.
+``planar`` is the classifier of IMoS (Ghosh et al. 2023) that Text2HOI uses: a two-layer LSTM for each of two planar
+views of the joints. ``recurrent`` reads the object as well. With ``text`` the outputs are a feature space shared with
+sentences.
 """
 
 from dataclasses import dataclass
@@ -22,20 +23,17 @@ PLANAR_SCALE = 0.1
 
 @dataclass(frozen=True)
 class EncoderConfig:
-    """trunk: which input and layers. outputs: labels, or size of the space shared with text. features: of a motion.
+    """Sizes of an evaluator network."""
 
-    width: of the layers inside. text: size of sentence features, 0 for a classifier.
-    """
-
-    trunk: Literal["planar", "recurrent"]
-    outputs: int
-    features: int
-    width: int = 64
-    text: int = 0
+    trunk: Literal["planar", "recurrent"]  # input and layers
+    outputs: int  # number of labels, or size of the space shared with text
+    features: int  # size of the feature of a motion
+    width: int = 64  # of hidden layers
+    text: int = 0  # size of sentence features, 0 for a classifier
 
 
 class PlanarTrunk(nn.Module):
-    """(B, 15, 126) joints to (B, 128) of both views together; the feature is its tanh times 0.1."""
+    """Maps (B, 15, 126) joints to the (B, 128) sum of both views, and to its tanh times 0.1 as the feature."""
 
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
@@ -54,7 +52,7 @@ class PlanarTrunk(nn.Module):
 
 
 class RecurrentTrunk(nn.Module):
-    """(B, T, 179) steps and their numbers (B,) to (B, F) features, read from both ends; padding counts nothing."""
+    """Bidirectional GRU over (B, T, 179) steps with (B,) lengths to (B, F) features; padding is ignored."""
 
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
@@ -76,7 +74,7 @@ TRUNKS = {"planar": PlanarTrunk, "recurrent": RecurrentTrunk}
 
 
 class MotionEncoder(nn.Module):
-    """Motions (B, T, size) with numbers of steps (B,) to features and logits; sentences to the space of the logits."""
+    """Encodes motions (B, T, size) of (B,) steps to features and logits, and sentences to the space of the logits."""
 
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
@@ -91,24 +89,24 @@ class MotionEncoder(nn.Module):
         return feature, self.head(inner)
 
     def of_text(self, text: Tensor) -> Tensor:
-        """(B, outputs) of length one, of sentence features (B, text)."""
+        """Unit vectors (B, outputs) of sentence features (B, text)."""
         assert self.text is not None
         return nn.functional.normalize(self.text(scaled_text(text)), dim=-1)
 
 
-def turned(motion: Tensor, angle: Tensor) -> Tensor:
-    """Motions (B, T, 179) turned about gravity by (B,) angles; hinge, turn and distances are what they were."""
+def rotated(motion: Tensor, angle: Tensor) -> Tensor:
+    """Rotate motions (B, T, 179) about the vertical by (B,) radians; hinge, heading and distances do not change."""
     cos, sin, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
-    rows = (torch.stack(row, -1) for row in ((cos, -sin, zero), (sin, cos, zero), (zero, zero, zero + 1)))
-    turn = torch.stack(list(rows), -2)[:, None]
-    spatial, rest = motion[..., : OBJECT.start + 3], motion[..., OBJECT.start + 9 :]
+    rows = (torch.stack(entries, -1) for entries in ((cos, -sin, zero), (sin, cos, zero), (zero, zero, zero + 1)))
+    rotation = torch.stack(list(rows), -2)[:, None]
+    spatial, unchanged = motion[..., : OBJECT.start + 3], motion[..., OBJECT.start + 9 :]
     columns = motion[..., OBJECT.start + 3 : OBJECT.start + 9].unflatten(-1, (3, 2))
-    points = spatial.unflatten(-1, (-1, 3)) @ turn.transpose(-1, -2)
-    return torch.cat((points.flatten(-2), (turn @ columns).flatten(-2), rest), -1)
+    points = spatial.unflatten(-1, (-1, 3)) @ rotation.transpose(-1, -2)
+    return torch.cat((points.flatten(-2), (rotation @ columns).flatten(-2), unchanged), -1)
 
 
 def _scale() -> Tensor:
-    """(179,) brings every number near one: metres of joints and object, and the distance that still counts."""
+    """(179,) input scale that brings positions and distances to the order of one."""
     scale = np.ones(CORRECTED_SIZE, np.float32)
     scale[: OBJECT.start + 3] = 1 / FAR_M
     scale[OBJECT.stop :] = 1 / FAR_M

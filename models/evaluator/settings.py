@@ -1,4 +1,4 @@
-"""Settings of the evaluator; importing them loads no torch."""
+"""Settings of the evaluator. This module does not import torch."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,10 +8,10 @@ NetworkName = Literal["paper", "corrected", "text-motion"]
 
 @dataclass(frozen=True)
 class EvaluatorSettings:
-    """networks: which are trained; none turns the evaluator off. Classifiers tell verbs apart.
+    """Networks that measure generated motions: classifiers of verbs, and a text-motion encoder.
 
-    seeds: a training each, of which the one with the middle validation accuracy is kept. most_steps: of the optimiser,
-    per training.
+    networks: the networks to train; empty turns the evaluator off. seeds: one training per seed; the one with the
+    median validation score is used. most_steps: optimiser steps per training.
     """
 
     networks: tuple[NetworkName, ...] = ()

@@ -22,7 +22,7 @@ from hoidata.clips.clip import Clip
 from hoidata.hands import HandPair
 from hoidata.refinement import carried_share, hold_clip
 from hoidata.settings import build_config
-from models.baselines.lookups import PROMPT_LOOKUP, VERB_LOOKUP
+from models.baselines.retrieval import PROMPT_LOOKUP, VERB_LOOKUP
 from models.common.family import Family, LeftOut, Sampler, Sources
 from models.text2hoi.family import NAMES, OtherPrompt, load_text2hoi, other_prompts
 from models.text2hoi.sampler import Candidate, SamplingConfig, Text2Hoi, best_candidates, verb_check_results

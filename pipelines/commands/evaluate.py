@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from hoidata.hands import HandPair
-    from pipelines.promises import Kept
+    from pipelines.expected_orderings import OrderingResult
 
 _FOLDER: Any = {"exists": True, "file_okay": False, "resolve_path": True}
 Store = Annotated[Path, typer.Argument(help="A store of predicted clips with ids <reference id>~<k>.", **_FOLDER)]
@@ -50,8 +50,8 @@ def evaluate(
 ) -> None:
     """Compare the predicted clips of a store with the recorded clips they stand for, and print a table of metrics."""
     from hoidata.files import write_whole
-    from hoidata.metrics.asked_metrics import with_lists
     from hoidata.metrics.evaluate import evaluate_store
+    from hoidata.metrics.optional_metrics import with_lists
     from pipelines.pages.metrics_table import printed_table, unmeasured_lines
     from pipelines.stages.base import jobs
 
@@ -103,21 +103,21 @@ def controls(
 
     The exit code is 1 if one has not.
     """
-    from pipelines.promises import datasets_below, kept, read_rows
+    from pipelines.expected_orderings import check_orderings, datasets_below, read_methods
 
     console, broken = Console(width=None if sys.stdout.isatty() else 160), 0
     for dataset in datasets_below(folder):
-        results = kept(read_rows(dataset))
+        results = check_orderings(read_methods(dataset))
         console.print(_table(str(dataset), [item for item in results if list_all or item.holds is not None]))
         counts = {holds: sum(item.holds is holds for item in results) for holds in WORDS}
         typer.echo(f"{counts[True]} hold, {counts[False]} do not, {counts[None]} were not measured")
-        for why, count in sorted(Counter(item.why for item in results if item.holds is None).items()):
-            typer.echo(f"  not measured: {count}: {why}")
+        for reason, count in sorted(Counter(item.reason for item in results if item.holds is None).items()):
+            typer.echo(f"  not measured: {count}: {reason}")
         broken += counts[False]
     raise typer.Exit(bool(broken))
 
 
-def _table(title: str, results: "list[Kept]") -> "Table":
+def _table(title: str, results: "list[OrderingResult]") -> "Table":
     from rich import box
     from rich.table import Table
 
@@ -129,6 +129,6 @@ def _table(title: str, results: "list[Kept]") -> "Table":
     table.add_column("must")
     table.add_column("holds")
     for item in results:
-        promise, values = item.promise, (number(item.reference), number(item.value))
-        table.add_row(promise.control, promise.metric, promise.beside, *values, promise.must, WORDS[item.holds])
+        ordering, values = item.ordering, (number(item.reference), number(item.value))
+        table.add_row(ordering.control, ordering.metric, ordering.reference, *values, ordering.must, WORDS[item.holds])
     return table

@@ -1,1 +1,1 @@
-"""Things to look at: animated GLB files, pages that play them, the report. Self-contained, the same bytes each time."""
+"""Animated GLB files, pages that play them and the report: self-contained HTML, equal inputs give equal bytes."""

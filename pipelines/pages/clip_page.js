@@ -1,4 +1,4 @@
-// The page of one clip: a cursor over the curves that follows the player, and the contact map of every frame.
+// The page of one clip: the cursor in the curves follows the player, and the object shows the contact map of the frame.
 "use strict";
 (function () {
   const NEIGHBOURS = 4;
@@ -23,38 +23,38 @@
   }
 
   function anyFrame(all) {
-    const found = new Uint8Array(paint.stride);
-    for (let i = 0; i < all.length; i++) found[i % paint.stride] |= all[i];
-    return found;
+    const union = new Uint8Array(paint.stride);
+    for (let i = 0; i < all.length; i++) union[i % paint.stride] |= all[i];
+    return union;
   }
 
   function touched(packed, point) {
     return packed[point >> 3] >> (7 - (point & 7)) & 1;
   }
 
-  // The few sampled points nearest to each vertex, with Gaussian weights as wide as the points lie apart.
+  // The closest sampled points of each vertex, with Gaussian weights as wide as the point spacing.
   function surfaceOf(mesh, part) {
-    const place = mesh.geometry.attributes.position, count = place.count;
+    const position = mesh.geometry.attributes.position, count = position.count;
     const nearest = new Uint16Array(count * NEIGHBOURS), weight = new Float32Array(count * NEIGHBOURS);
-    const known = Math.min(NEIGHBOURS, part.numbers.length);
+    const neighbours = Math.min(NEIGHBOURS, part.numbers.length);
     const best = new Float64Array(NEIGHBOURS), which = new Int32Array(NEIGHBOURS);
     for (let vertex = 0; vertex < count; vertex++) {
       best.fill(Infinity);
-      const x = place.getX(vertex), y = place.getY(vertex), z = place.getZ(vertex);
+      const x = position.getX(vertex), y = position.getY(vertex), z = position.getZ(vertex);
       for (let point = 0; point < part.numbers.length; point++) {
         const dx = part.tenth_mm[3 * point] * 1e-4 - x, dy = part.tenth_mm[3 * point + 1] * 1e-4 - y, dz = part.tenth_mm[3 * point + 2] * 1e-4 - z;
         const square = dx * dx + dy * dy + dz * dz;
-        let slot = known;
+        let slot = neighbours;
         while (slot > 0 && square < best[slot - 1]) slot--;
-        if (slot >= known) continue;
-        for (let later = known - 1; later > slot; later--) { best[later] = best[later - 1]; which[later] = which[later - 1]; }
+        if (slot >= neighbours) continue;
+        for (let later = neighbours - 1; later > slot; later--) { best[later] = best[later - 1]; which[later] = which[later - 1]; }
         best[slot] = square;
         which[slot] = point;
       }
-      const width = Math.max(best[known - 1], 1e-10);
+      const width = Math.max(best[neighbours - 1], 1e-10);
       let sum = 0;
-      for (let k = 0; k < known; k++) sum += Math.exp(-2 * best[k] / width);
-      for (let k = 0; k < known; k++) {
+      for (let k = 0; k < neighbours; k++) sum += Math.exp(-2 * best[k] / width);
+      for (let k = 0; k < neighbours; k++) {
         nearest[vertex * NEIGHBOURS + k] = part.numbers[which[k]];
         weight[vertex * NEIGHBOURS + k] = Math.exp(-2 * best[k] / width) / sum;
       }
@@ -89,23 +89,23 @@
     };
   }
 
-  // steps: BimArt's map of one hand in one frame; what is beyond its reach has the last colour.
+  // steps: BimArt's distance map of one hand in one frame; larger distances get the last colour.
   function distanceColours(steps) {
     return (nearest, weight, first) => {
       let value = 0;
       for (let k = first; k < first + NEIGHBOURS; k++) value += weight[k] * Math.min(steps[nearest[k]], paint.farthest);
-      const place = value / paint.farthest * (nearToFar.length - 1);
-      const low = Math.min(Math.floor(place), nearToFar.length - 2);
-      return nearToFar[low].map((near, c) => near + (nearToFar[low + 1][c] - near) * (place - low));
+      const position = value / paint.farthest * (nearToFar.length - 1);
+      const low = Math.min(Math.floor(position), nearToFar.length - 2);
+      return nearToFar[low].map((near, c) => near + (nearToFar[low + 1][c] - near) * (position - low));
     };
   }
 
   function showPaint() {
     const mode = document.querySelector("input[name=paint]:checked").value;
     const frame = player.frame();
-    const wanted = mode === "clip" || mode === "none" ? mode : `${mode} ${frame}`;
-    if (wanted === painted || !surfaces.length) return;
-    painted = wanted;
+    const requested = mode === "clip" || mode === "none" ? mode : `${mode} ${frame}`;
+    if (requested === painted || !surfaces.length) return;
+    painted = requested;
     const rows = (all, stride) => all.subarray(frame * stride, (frame + 1) * stride);
     if (mode in distances) repaint(distanceColours(rows(distances[mode], paint.points)));
     else if (mode === "frame") repaint(contactColours(rows(bits.left, paint.stride), rows(bits.right, paint.stride)));

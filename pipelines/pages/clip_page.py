@@ -1,4 +1,4 @@
-"""One clip as one self-contained page: it plays, with contact, curves, words, evidence and origin below it."""
+"""The page of one clip: self-contained HTML with the motion, contact, curves, sentences, evidence and provenance."""
 
 import base64
 import re
@@ -28,7 +28,7 @@ from pipelines.pages.examples import true_contact
 from pipelines.pages.player import Player, contact_player, motion_player, write_page
 from pipelines.pages.surface import ContactPaint
 
-# Near to far, as BimArt draws its maps (figure 9): red where the hand is close, blue where it is 20 cm away.
+# From near to far, as in BimArt (Fig. 9): red where the hand is close, blue at 20 cm.
 DISTANCE_COLOURS = ("#b5241c", "#efb35b", "#f3efdd", "#7fb0d0", "#2a5f96")
 PAINT_COLOURS = {**SIDE_COLOURS, "both": BOTH_COLOUR}
 
@@ -41,8 +41,12 @@ def page_name(clip_id: str) -> str:
 def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, hands: HandPair) -> Path:
     """Write the page of one clip; equal inputs give equal bytes.
 
-    annotated: its dataset, with quality control's folder beside it. hands: the model of its store. Raises
-    MissingResource that names the stage where quality control has not run.
+    Args:
+        annotated: the dataset of the clip, with the output of quality control next to it.
+        hands: the hand model of the store.
+
+    Raises:
+        MissingResource: quality control has not run; the message names its stage.
     """
     clip = annotated.clip(clip_id)
     quality = clip_quality(annotated.root / "quality", clip_id)
@@ -82,12 +86,19 @@ def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, h
 def paint_values(
     clip: Clip, points: SampledPoints, touched: Mapping[Side, np.ndarray], maps: Mapping[Side, np.ndarray] | None = None
 ) -> dict:
-    """What clip_page.js needs to paint the contact map of any frame, as JSON knows it.
+    """The data from which clip_page.js paints the contact map of any frame, as a JSON object.
 
-    parts: per part that has triangles, the name of its node in the GLB, points in its mesh's coordinates (the moving
-    part is drawn from its hinge's origin) in 0.1 mm, and their numbers among all points. left, right: touched points
-    per frame, packed bits (first point in the highest bit) in base64, ``stride`` bytes per frame. distances: of each
-    hand of ``maps``, BimArt's map (frame, point) in metres, packed, in base64; ``farthest`` steps are its reach.
+    Args:
+        touched: per side (frame, point) bool.
+        maps: per side BimArt's distance map (frame, point), metres.
+
+    Returns:
+        - parts: per object part, the name of its node in the GLB, its sampled points in mesh coordinates in 0.1 mm (the
+          mesh of the moving part starts at the hinge), and their indices among all points
+        - left, right: touched points per frame, packed bits in base64, first point in the highest bit
+        - stride, frames, points: bytes per frame, and the sizes of these arrays
+        - distances: per side, the packed distance map in base64
+        - farthest: the largest packed distance
     """
     model = clip.object.model
     parts = []
@@ -109,15 +120,16 @@ def paint_values(
 
 
 def _still_maps(clip: Clip, series: ClipSeries, points: SampledPoints) -> list[Player]:
-    """Per hand that touches: the object to turn, each point by its share of the hand's frames in contact."""
+    """Per touching hand, a player of the object, coloured by the fraction of the hand's contact frames per point."""
     players = []
     for side in SIDES:
         touching = int(series.touched[side].any(axis=1).sum())
         if not touching:
             continue
-        share = series.touched[side].sum(axis=0) / touching
-        paint = ContactPaint(points.points_m, points.part, share)
-        caption = f"{side} hand, {int((share > 0).sum()):,} points, in contact in {touching} of {clip.n_frames} frames"
-        label = "share of these frames, 0 to 1"
+        fraction = series.touched[side].sum(axis=0) / touching
+        paint = ContactPaint(points.points_m, points.part, fraction)
+        n_points = int((fraction > 0).sum())
+        caption = f"{side} hand, {n_points:,} points, in contact in {touching} of {clip.n_frames} frames"
+        label = "fraction of these frames, 0 to 1"
         players.append(contact_player(clip, paint, caption, caption, label))
     return players

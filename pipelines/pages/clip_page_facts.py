@@ -1,6 +1,6 @@
-"""What one clip's page says and plots: words, what the hand type rests on, quality, splits, origin, series by frame.
+"""The content of a clip page: sentences, evidence for the hand type, quality, splits, provenance and time series.
 
-Contact with points and hand types are read from the folders of the stages; the exact surface is asked here.
+Contact with sampled points and hand types are read from the stages; distances to the exact surface are computed here.
 """
 
 from dataclasses import dataclass
@@ -28,79 +28,71 @@ NOTHING = "none"
 
 @dataclass(frozen=True)
 class ClipSeries:
-    """Everything per frame (frame,), NaN where it means nothing.
+    """The time series of one clip, (frame,) unless stated otherwise; NaN if undefined."""
 
-    touched: per side (frame, point) bool, the contact map of each frame. evidence: what the hand type rests on.
-    surface: per side the hand against the exact surface. solid: whether anything can be inside the object, so that
-    depths mean something.
-    lift_m: height of the object above its first frame, or None without gravity. hinge_rad: None for a rigid object.
-    """
-
-    touched: dict[Side, np.ndarray]
-    evidence: HandEvidence
-    surface: dict[Side, SideSurface]
-    solid: bool
-    speed_m_s: np.ndarray
-    lift_m: np.ndarray | None
-    hinge_rad: np.ndarray | None
+    touched: dict[Side, np.ndarray]  # per side (frame, point) bool, the contact map of each frame
+    evidence: HandEvidence  # distances that decide the hand type
+    surface: dict[Side, SideSurface]  # per side, distances to the exact surface
+    solid: bool  # the object is a closed solid, so depth is defined
+    speed_m_s: np.ndarray  # of the object
+    lift_m: np.ndarray | None  # height of the object above its first frame; None without gravity
+    hinge_rad: np.ndarray | None  # None for a rigid object
 
     def touched_count(self, side: Side) -> np.ndarray:
-        """(frame,) how many of the sampled points this hand touches."""
+        """(frame,) number of sampled points that this hand touches."""
         return self.touched[side].sum(axis=1)
 
     @property
     def depth_m(self) -> dict[Side, np.ndarray] | None:
-        """Per side the deepest hand vertex inside the object, or None where the mesh has no inside."""
-        return {side: found.depth_m for side, found in self.surface.items()} if self.solid else None
+        """Per side (frame,) depth of the deepest hand vertex in the object; None if the object is not solid."""
+        return {side: measured.depth_m for side, measured in self.surface.items()} if self.solid else None
 
     @property
     def surface_evidence(self) -> HandEvidence:
-        """The hand test against the exact surface in place of sampled points, at the same threshold."""
-        distance: dict[Side, np.ndarray] = {side: found.joint_m for side, found in self.surface.items()}
+        """The evidence for the hand type from the exact surface in place of sampled points, at the same threshold."""
+        distance: dict[Side, np.ndarray] = {side: measured.joint_m for side, measured in self.surface.items()}
         return HandEvidence(None, distance, self.evidence.threshold_m).at_threshold(self.evidence.threshold_m)
 
 
 @dataclass(frozen=True)
 class HandDecision:
-    """The hand type, in words how it was found, and what the exact surface says.
-
-    hands: of each hand side, valid frames, then whether it acts and how near it comes, by points and by the surface.
-    """
+    """The hand type of a clip with its evidence, as texts."""
 
     hand_type: str
-    rule: str
-    agreement: str
-    surface: str
-    points: int
-    hands: Rows
+    rule: str  # how it is decided
+    agreement: str  # comparison with the label of the source
+    surface: str  # comparison with the exact surface
+    points: int  # number of sampled points of the object
+    hands: Rows  # per hand: side, valid frames, then activity and minimum distance by points and by surface
 
 
 @dataclass(frozen=True)
 class ClipQuality:
-    """Verdict and reasons of quality control, and the measures: (what, value, warn above, leave out above)."""
+    """Verdict, reasons and measures of quality control for one clip."""
 
     verdict: str
     reasons: str
     note: str
-    measures: Rows
+    measures: Rows  # (measure, value, limit of warnings, limit of exclusion)
 
 
 def sentence_rows(annotated: AnnotatedStore, clip_id: str) -> list[tuple[str, list[str]]]:
-    """(form, sentences) as the stage annotate wrote them, in its order; nothing for a clip that got none."""
-    rows = annotated.text[annotated.text["clip_id"] == clip_id]
-    forms = dict.fromkeys(rows["form"].tolist())
-    return [(str(form), rows.loc[rows["form"] == form, "sentence"].tolist()) for form in forms]
+    """(form, sentences) of the stage annotate, in its order; empty for a clip without sentences."""
+    texts = annotated.text[annotated.text["clip_id"] == clip_id]
+    forms = dict.fromkeys(texts["form"].tolist())
+    return [(str(form), texts.loc[texts["form"] == form, "sentence"].tolist()) for form in forms]
 
 
 def hand_decision(annotated: AnnotatedStore, clip: Clip, series: ClipSeries) -> HandDecision:
-    """What the stage annotate decided, and the distances it rests on."""
-    row = annotated.hand_types.loc[clip.clip_id]
+    """The decision of the stage annotate and its evidence."""
+    decision = annotated.hand_types.loc[clip.clip_id]
     threshold, points = annotated.annotation_info["threshold_m"], annotated.annotation_info["points"]
+    addition = _annotated_rule(annotated, decision["source"])
     return HandDecision(
-        hand_type=NOTHING if pd.isna(row["hand_type"]) else str(row["hand_type"]),
-        rule=f"A hand acts when, in any frame, one of its 21 joints is closer than {threshold * 100:g} cm to one of "
-        f"{points:,} points of the object (Text2HOI, supplement 6).{_annotated_rule(annotated, row['source'])}",
-        agreement=_agreement(clip, row["agreement"]),
+        hand_type=NOTHING if pd.isna(decision["hand_type"]) else str(decision["hand_type"]),
+        rule=f"A hand is active if one of its 21 joints comes closer than {threshold * 100:g} cm to one of "
+        f"{points:,} sampled points of the object (Text2HOI, supplement 6).{addition}",
+        agreement=_agreement(clip, decision["agreement"]),
         surface=_surface_words(series),
         points=points,
         hands=[_hand_facts(annotated, clip, series, side) for side in SIDES],
@@ -108,25 +100,25 @@ def hand_decision(annotated: AnnotatedStore, clip: Clip, series: ClipSeries) -> 
 
 
 def _annotated_rule(annotated: AnnotatedStore, source: Any) -> str:
-    """What ``annotate.hand`` adds to the rule; nothing by default."""
+    """The addition of the setting ``annotate.hand`` to the rule; "" by default."""
     if annotated.annotation_info.get("hand", "proximity") == "proximity":
         return ""
-    taken = "as here" if source == "annotated" else "which is not so here"
-    return f" Where the source's annotator named a hand, that one is taken instead, {taken}."
+    used = "as for this clip" if source == "annotated" else "but not for this clip"
+    return f" If the source has a label of the hand, the label is used instead, {used}."
 
 
 def _agreement(clip: Clip, agreement: Any) -> str:
     if clip.labelled_hand is None:
-        return "The source names no hand."
+        return "The source has no label of the hand."
     verdict = "which agrees" if bool(agreement) else "which DISAGREES"
-    return f"The source's annotator named: {clip.labelled_hand}, {verdict}."
+    return f"Label of the source: {clip.labelled_hand}, {verdict}."
 
 
 def _surface_words(series: ClipSeries) -> str:
-    """Whether the same test against the surface gives the same hand."""
+    """Whether the exact surface gives the same hand type."""
     by_points, exact = series.evidence.hand_type or NOTHING, series.surface_evidence.hand_type or NOTHING
     verdict = "the same" if by_points == exact else f"{exact}, which DIFFERS"
-    return f"With the object's exact surface in place of the points the hand type is {verdict}."
+    return f"With the exact surface in place of sampled points the hand type is {verdict}."
 
 
 def _hand_facts(annotated: AnnotatedStore, clip: Clip, series: ClipSeries, side: Side) -> tuple[str, ...]:
@@ -134,12 +126,12 @@ def _hand_facts(annotated: AnnotatedStore, clip: Clip, series: ClipSeries, side:
     valid, distance = clip.hands[side].valid, points.distance_m[side]
     count = f"{int(valid.sum())} of {clip.n_frames}"
     if not valid.any():
-        return side, count, "no", "never seen", *[""] * 5
+        return side, count, "no", "never visible", *[""] * 5
     frame = int(distance.argmin())
     within, exact = int(points.near(side).sum()), int(surface.near(side).sum())
-    where = f"frame {frame}{_joint(annotated, clip.clip_id, side, frame)}"
+    position = f"frame {frame}{_joint(annotated, clip.clip_id, side, frame)}"
     return (
-        *(side, count, _yes(within), f"{distance[frame] * 100:.2f} cm", where, f"{within} of {clip.n_frames}"),
+        *(side, count, _yes(within), f"{distance[frame] * 100:.2f} cm", position, f"{within} of {clip.n_frames}"),
         *(_yes(exact), f"{surface.closest_m(side) * 100:.2f} cm", f"{exact} of {clip.n_frames}"),
     )
 
@@ -149,26 +141,26 @@ def _yes(frames: int) -> str:
 
 
 def _joint(annotated: AnnotatedStore, clip_id: str, side: Side, frame: int) -> str:
-    """Which joint is nearest in a frame, where the contact stage kept its distance."""
+    """The name of the closest joint in a frame, if the contact stage stored its distance."""
     entries = annotated.distances(clip_id, side)
     here = entries.select(entries.frame == frame)
     return f", {JOINT_NAMES[int(here.joint[here.distance_m.argmin()])]}" if len(here.frame) else ""
 
 
 def clip_quality(folder: Path, clip_id: str) -> ClipQuality:
-    """What quality control found. Raises MissingResource where its stage has not run."""
+    """The result of quality control. Raises MissingResource if its stage has not run."""
     require_output(folder, "quality", "clips.parquet")
-    row = read_table(folder / "clips.parquet").set_index("clip_id").loc[clip_id]
+    record = read_table(folder / "clips.parquet").set_index("clip_id").loc[clip_id]
     limits = read_limits(folder)
     measures = [
         (
             f"{measure.words}{', ' + measure.unit if measure.unit else ''}",
-            _number(row[measure.name]),
+            _number(record[measure.name]),
             *(_number(limits[measure.name][end], "") for end in ("warn", "leave_out")),
         )
         for measure in CLIP_MEASURES
     ]
-    return ClipQuality(str(row["verdict"]), str(row["reasons"] or ""), str(row["note"] or ""), measures)
+    return ClipQuality(str(record["verdict"]), str(record["reasons"] or ""), str(record["note"] or ""), measures)
 
 
 def _number(value: Any, missing: str = "not measured") -> str:
@@ -178,9 +170,9 @@ def _number(value: Any, missing: str = "not measured") -> str:
 def split_rows(annotated: AnnotatedStore, clip_id: str) -> Rows:
     """(split, part) of every named split of the dataset; the chosen one first."""
     table = read_table(annotated.root / "splits" / "splits.parquet").set_index("clip_id")
-    row = table.loc[clip_id]
+    parts_by_split = table.loc[clip_id]
     chosen = str(annotated.split_info["chosen"]["name"])
-    parts = [(str(name), NOTHING if pd.isna(part) else str(part)) for name, part in row.items()]
+    parts = [(str(name), NOTHING if pd.isna(part) else str(part)) for name, part in parts_by_split.items()]
     others = [(name, part) for name, part in parts if name not in ("split", chosen)]
     return [(f"{chosen} (chosen)", dict(parts)["split"]), *others]
 
@@ -203,32 +195,32 @@ def clip_facts(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> Rows:
         ("hands from", _hands_from(clip)),
         ("hand model", "; ".join(filter(None, (hands.name, stand_in_note(annotated.info))))),
         ("camera", _camera(clip)),
-        ("also there", _further(clip)),
+        ("further data", _further(clip)),
         ("licence", licence),
     ]
 
 
 def source_rows(clip: Clip) -> Rows:
-    """(path below the raw folder, bytes, SHA-256) of every raw file behind the clip."""
+    """(path below the raw folder, bytes, SHA-256) of every raw file of the clip."""
     return [(source.path, f"{source.size:,}", source.sha256) for source in clip.sources]
 
 
 def _verb(annotated: AnnotatedStore, clip: Clip) -> str:
-    """The source's word, or the one derived from the motion, marked as such, with what it rests on."""
-    row = annotated.hand_types.loc[clip.clip_id]
-    if row["verb_source"] == "derived":
-        return f"{row['verb']}, derived from the motion ({row['verb_evidence']}): the source has no label"
+    """The verb of the source, or the verb derived from the motion with its evidence."""
+    decision = annotated.hand_types.loc[clip.clip_id]
+    if decision["verb_source"] == "derived":
+        return f"{decision['verb']}, derived from the motion ({decision['verb_evidence']}): the source has no label"
     return clip.verb or "no label in the source"
 
 
 def source_frames_text(clip: Clip) -> str:
-    """Which frames of the source a clip has, and how many frames were made between them."""
+    """The frames of the source that a clip has, and the number of interpolated frames."""
     recorded = clip.source_frames[clip.recorded]
     steps = np.unique(np.diff(recorded)).tolist()
-    every = "" if steps == [1] or not steps else f", in steps of {' or '.join(map(str, steps[:3]))}"
-    made = clip.n_frames - len(recorded)
-    note = f"; {made} of {clip.n_frames} frames are interpolated" if made else ""
-    return f"{recorded[0]} to {recorded[-1]}{every}; the source has {clip.source_fps:g} per second{note}"
+    steps_text = "" if steps == [1] or not steps else f", in steps of {' or '.join(map(str, steps[:3]))}"
+    interpolated = clip.n_frames - len(recorded)
+    note = f"; {interpolated} of {clip.n_frames} frames are interpolated" if interpolated else ""
+    return f"{recorded[0]} to {recorded[-1]}{steps_text}; the source has {clip.source_fps:g} per second{note}"
 
 
 def _gravity(clip: Clip) -> str:
@@ -255,10 +247,10 @@ def _camera(clip: Clip) -> str:
 
 
 def _further(clip: Clip) -> str:
-    found = ["body parameters"] if clip.body is not None else []
+    extras = ["body parameters"] if clip.body is not None else []
     if clip.source_contact is not None:
-        found.append(f"contact labels of the source ({len(clip.source_contact.frame):,} entries)")
-    return "; ".join(found) or "nothing"
+        extras.append(f"contact labels of the source ({len(clip.source_contact.frame):,} entries)")
+    return "; ".join(extras) or "nothing"
 
 
 def measure_clip(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> ClipSeries:

@@ -1,4 +1,4 @@
-"""Charts over the frames of one clip, one below the other over a shared axis, and what a page needs for a cursor."""
+"""Charts over the frames of one clip with a shared axis, and their positions for the cursor of the page."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from hoidata.surface.contact import TOUCH_M
 from pipelines.pages.clip_page_facts import ClipSeries
 from pipelines.pages.curves import figure_svg
 
-# Stronger than the hands' own colours: lines are thin. clip_page.js paints contact in the same.
+# Darker than the colours of the hands, because lines are thin. clip_page.js paints contact in these colours.
 LEFT_COLOUR, RIGHT_COLOUR, BOTH_COLOUR, OBJECT_COLOUR = "#2f6fb0", "#c4571b", "#7b3f99", "#55595f"
 SIDE_COLOURS = {"left": LEFT_COLOUR, "right": RIGHT_COLOUR}
 LIMIT_COLOUR = "#8a8f96"
@@ -24,68 +24,71 @@ FARTHEST_CM = 12.0
 
 @dataclass(frozen=True)
 class Line:
-    """One line of a chart: values (frame,), NaN where there is none."""
+    """One line of a chart."""
 
     name: str
     colour: str
-    values: np.ndarray
+    values: np.ndarray  # (frame,), NaN if undefined
 
 
 @dataclass(frozen=True)
 class Chart:
-    """Lines in one unit. least: the axis spans at least this much, so that a still object does not look restless.
-
-    limit: a dashed line with its name. top: where the axis ends, values beyond leave the chart. decimals: of the values
-    the page shows under the cursor.
-    """
+    """Lines with the same unit."""
 
     title: str
     unit: str
     lines: list[Line]
-    least: float
-    limit: tuple[float, str] | None = None
-    top: float | None = None
-    decimals: int = 1
+    least: float  # smallest range of the axis, so that noise of a still object does not fill the chart
+    limit: tuple[float, str] | None = None  # value and name of a dashed line
+    top: float | None = None  # end of the axis; larger values are cut off
+    decimals: int = 1  # of the values under the cursor
 
 
 @dataclass(frozen=True)
 class ChartSpan:
-    """A chart on the page. top: per cent of the drawing's height; values: per line, None where there is none."""
+    """Position and values of a chart on the page."""
 
     title: str
     unit: str
-    top: float
-    lines: list[dict]
+    top: float  # percent of the drawing's height
+    lines: list[dict]  # ``_readout`` of each line
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """The drawing; left, right: per cent of its width where frame 0 and the last frame lie."""
+    """The drawing of all charts."""
 
     svg: Markup
-    left: float
-    right: float
+    left: float  # percent of the width at frame 0
+    right: float  # percent of the width at the last frame
     charts: list[ChartSpan] = field(default_factory=list)
 
 
 def clip_charts(series: ClipSeries, sides: Sequence[Side], point_count: int) -> list[Chart]:
-    """What the page of a clip plots; sides: the hands that are ever valid."""
+    """The charts of a clip page for the hands ``sides``."""
     threshold_cm = series.evidence.threshold_m * 100
     touched = [Line(side, SIDE_COLOURS[side], series.touched_count(side).astype(float)) for side in sides]
     nearest = {side: np.where(np.isfinite(m), m, np.nan) for side, m in series.evidence.distance_m.items()}
     near = [Line(side, SIDE_COLOURS[side], nearest[side] * 100) for side in sides]
     charts = [
-        Chart(f"touched, of {point_count:,} points of the object", "points", touched, 10, decimals=0),
-        Chart("nearest joint to the object", "cm", near, 3, (threshold_cm, f"{threshold_cm:g} cm"), FARTHEST_CM),
+        Chart("touched sampled points", f"of {point_count:,}", touched, 10, decimals=0),
+        Chart(
+            title="distance of the closest joint to the object",
+            unit="cm",
+            lines=near,
+            least=3,
+            limit=(threshold_cm, f"{threshold_cm:g} cm"),
+            top=FARTHEST_CM,
+        ),
     ]
     vertices = [
         Line(side, SIDE_COLOURS[side], series.surface[side].touched.sum(axis=1).astype(float)) for side in sides
     ]
-    title = f"hand within {TOUCH_M * 1000:g} mm of the object's surface"
-    charts.append(Chart(title, "vertices of 778", vertices, 10, decimals=0))
+    title = f"hand vertices within {TOUCH_M * 1000:g} mm of the object's surface"
+    charts.append(Chart(title, "of 778", vertices, 10, decimals=0))
     if series.depth_m is not None:
         depths = [Line(side, SIDE_COLOURS[side], series.depth_m[side] * 1000) for side in sides]
-        charts.append(Chart("deepest hand vertex inside the object", "mm", depths, 2))
+        charts.append(Chart("depth of the deepest hand vertex in the object", "mm", depths, 2))
     return [chart for chart in charts if chart.lines] + _object_charts(series)
 
 
@@ -95,12 +98,14 @@ def _object_charts(series: ClipSeries) -> list[Chart]:
         title = "height of the object above its first frame"
         charts.insert(0, Chart(title, "cm", [Line("object", OBJECT_COLOUR, series.lift_m * 100)], 2))
     if series.hinge_rad is not None:
-        charts.append(Chart("hinge", "degrees", [Line("object", OBJECT_COLOUR, np.degrees(series.hinge_rad))], 10))
+        charts.append(
+            Chart("hinge angle", "degrees", [Line("object", OBJECT_COLOUR, np.degrees(series.hinge_rad))], 10)
+        )
     return charts
 
 
 def draw_timeline(charts: Sequence[Chart], salt: str) -> Timeline:
-    """All charts of equally many frames as one drawing; salt keeps the ids of several drawings apart."""
+    """All charts as one drawing; ``salt`` makes the SVG ids of several drawings different."""
     drawn: list[Axes] = []
 
     def draw(figure: Figure) -> None:
@@ -138,19 +143,19 @@ def _draw_chart(axes: Axes, chart: Chart) -> None:
 
 
 def _range(chart: Chart) -> tuple[float, float]:
-    """From 0, or the lowest value below it, to the largest value; the limit in sight, not beyond ``top``."""
+    """The axis range: from the lowest value or 0 to the largest value, with the limit visible, up to ``top``."""
     values = np.concatenate([line.values for line in chart.lines])
     values = values[np.isfinite(values)]
     low, high = float(values.min(initial=0.0)), float(values.max(initial=0.0))
     high = max(high, chart.limit[0] * 1.5 if chart.limit else 0.0)
     high = min(high, chart.top) if chart.top is not None else high
     high = max(high, low + chart.least)
-    room = 0.06 * (high - low)
-    return low - (room if low < 0 else room / 3), high + room
+    margin = 0.06 * (high - low)
+    return low - (margin if low < 0 else margin / 3), high + margin
 
 
 def _readout(line: Line, decimals: int) -> dict:
-    """Name, colour and values rounded for people, as JSON knows them."""
+    """Name, colour and rounded values of a line, as a JSON object."""
     rounded = [round(float(value), decimals) if np.isfinite(value) else None for value in line.values]
     return {"name": line.name, "colour": line.colour, "values": rounded, "decimals": decimals}
 

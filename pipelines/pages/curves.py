@@ -1,4 +1,4 @@
-"""Curves as inline SVG: equal numbers give equal markup."""
+"""Curves as inline SVG; equal numbers give equal markup."""
 
 import io
 import re
@@ -47,13 +47,13 @@ class Panel:
 
     @property
     def is_logarithmic(self) -> bool:
-        """Positive values that span more than 20 to 1 are drawn on a logarithmic axis."""
+        """Whether the axis is logarithmic: for positive values whose ratio exceeds 20."""
         values = np.concatenate([curve.y for curve in self.curves])
         return bool(values.min() > 0 and values.max() / values.min() > LOG_RATIO)
 
 
 def panels_svg(panels: list[Panel], x_label: str, salt: str, panel_inches: tuple[float, float] = (2.9, 2.4)) -> str:
-    """Charts side by side as one ``<svg>`` element; ``salt`` keeps the ids of several drawings on one page apart."""
+    """Charts next to each other as one ``<svg>``; ``salt`` makes the ids of several drawings on a page different."""
 
     def draw(figure: Figure) -> None:
         for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
@@ -63,7 +63,7 @@ def panels_svg(panels: list[Panel], x_label: str, salt: str, panel_inches: tuple
 
 
 def figure_svg(inches: tuple[float, float], salt: str, draw: Callable[[Figure], None]) -> str:
-    """What ``draw`` draws on an empty figure, in the style of the pages, as one ``<svg>`` element; salt as above."""
+    """Call ``draw`` on an empty Matplotlib canvas in the style of the pages and return one ``<svg>`` element."""
     style: dict[Any, Any] = {**_STYLE, "svg.hashsalt": salt}
     with matplotlib.rc_context(style):
         figure = Figure(figsize=inches, layout="constrained")
@@ -89,18 +89,19 @@ def _draw_panel(axes: Axes, panel: Panel, x_label: str) -> None:
 
 
 def read_log(path: str | Path) -> dict[str, np.ndarray]:
-    """The numeric columns of a training log, by name; an empty cell is NaN, a column of words is left out."""
+    """The numeric columns of a training log; empty cells are NaN, text columns are skipped."""
     table = pd.read_csv(path).apply(pd.to_numeric, errors="coerce").dropna(axis="columns", how="all")
     return {str(name): np.asarray(table[name], np.float64) for name in table}
 
 
 def log_curves(columns: dict[str, np.ndarray], x_name: str = "step") -> list[Curve]:
-    """Every loss column of a log over its step; rows without that number (validation is rarer) are skipped."""
+    """All loss columns of a log over the step, without empty cells: validation is rarer."""
     if x_name not in columns:
         return []
     curves = []
     for name, values in columns.items():
-        here = np.isfinite(values)
-        if name != x_name and re.search("loss|train|valid", name) and here.any():
-            curves.append(Curve(name.removeprefix("train_").replace("_", " "), columns[x_name][here], values[here]))
+        finite = np.isfinite(values)
+        if name != x_name and re.search("loss|train|valid", name) and finite.any():
+            title = name.removeprefix("train_").replace("_", " ")
+            curves.append(Curve(title, columns[x_name][finite], values[finite]))
     return curves

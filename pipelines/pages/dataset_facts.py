@@ -1,7 +1,7 @@
-"""The facts of one dataset as the report shows them, read from the folders its stages wrote."""
+"""The facts of one dataset for the report, read from the outputs of its stages."""
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pandas as pd
@@ -17,54 +17,57 @@ MOST_FREQUENT = 12
 
 @dataclass(frozen=True)
 class DatasetFacts:
-    """Numbers and tables of one dataset.
-
-    tiles: (number, name). counts: (title, [(name, clips)]). quarantine: rows of the store's table, as dicts.
-    annotated: None where no clip is annotated; empty: the reason, where there is no clip at all.
-    """
+    """Numbers and tables of one dataset."""
 
     name: str
-    synthetic: bool
-    empty: str
-    tiles: list[tuple[str, str]]
-    counts: list[tuple[str, list[tuple[str, int]]]]
-    quarantine: list[dict[str, str]]
-    annotated: AnnotatedStore | None
-    info: dict
+    synthetic: bool = False
+    empty: str = ""  # why the dataset has no clips
+    tiles: list[tuple[str, str]] = field(default_factory=list)  # (number, name)
+    counts: list[tuple[str, list[tuple[str, int]]]] = field(default_factory=list)  # (title, [(name, clips)])
+    quarantine: list[dict[str, str]] = field(default_factory=list)  # records of the store's quarantine table
+    annotated: AnnotatedStore | None = None  # None if no clip is annotated
+    info: dict = field(default_factory=dict)  # of the store
 
     @property
     def missing_subsets(self) -> list[str]:
-        """What it means that parts of the chosen split have no clips."""
+        """The consequences of subsets of the chosen split without clips, in words."""
         return [] if self.annotated is None else list(self.annotated.missing_subsets.values())
 
     @property
     def reasons(self) -> list[tuple[str, int]]:
-        """What the sequences left out should have been, most frequent first."""
-        return _frequent([row["expected"] for row in self.quarantine], "")
+        """The violated expectations of skipped sequences with counts, most frequent first."""
+        return _frequent([record["expected"] for record in self.quarantine], "")
 
 
 def read_dataset(root: Path, name: str, hands: HandPair) -> DatasetFacts:
     """Facts of the dataset below ``root`` (its ``clips``, ``annotation``, ``contact`` and ``splits`` folders)."""
     reason = reason_for_nothing(root / "clips")
     if not (root / "clips" / "meta" / "info.json").is_file():
-        return DatasetFacts(name, False, reason or "it was not converted", [], [], [], None, {})
+        return DatasetFacts(name, empty=reason or "it was not converted")
     store = open_store(root / "clips", hands)
-    quarantine = [{key: str(row[key]) for key in store.quarantine} for row in store.quarantine.to_dict("records")]
+    quarantine = [{key: str(record[key]) for key in store.quarantine} for record in store.quarantine.to_dict("records")]
     if not len(store):
-        return DatasetFacts(name, False, reason or "no sequence gave a clip", [], [], quarantine, None, store.info)
+        empty = reason or "no sequence gave a clip"
+        return DatasetFacts(name, empty=empty, quarantine=quarantine, info=store.info)
     annotated = load_annotated(root, hands) if has_tables(root) else None
-    synthetic = bool(store.sequences["synthetic"].any())
-    tiles, counts = _tiles(store, annotated), _counts(store, annotated)
-    return DatasetFacts(name, synthetic, "", tiles, counts, quarantine, annotated, store.info)
+    return DatasetFacts(
+        name=name,
+        synthetic=bool(store.sequences["synthetic"].any()),
+        tiles=_tiles(store, annotated),
+        counts=_counts(store, annotated),
+        quarantine=quarantine,
+        annotated=annotated,
+        info=store.info,
+    )
 
 
 def reason_for_nothing(folder: Path) -> str:
-    """The reason a stage noted in ``folder/empty.json``; "" where it noted none."""
+    """The reason in ``folder/empty.json``; "" without that file."""
     return empty_reason(folder) or ""
 
 
 def has_tables(root: Path, *tables: str) -> bool:
-    """Whether the stages have left these files below a dataset's folder, and what annotated clips need."""
+    """Whether a dataset's folder has these files and those that annotated clips need."""
     needed = ("annotation/text.parquet", "contact/points.npz", "splits/splits.parquet")
     return all((root / table).is_file() for table in (*tables, *needed))
 
@@ -88,9 +91,9 @@ def _tiles(store: Store, annotated: AnnotatedStore | None) -> list[tuple[str, st
 
 
 def majority_verb(annotated: AnnotatedStore) -> list[tuple[str, str]]:
-    """The accuracy of always guessing the most frequent verb of the training clips, as a tile; none without test clips.
+    """The accuracy of always guessing the most frequent training verb, as a tile; none without test clips.
 
-    Of equally frequent verbs the first in the alphabet counts.
+    Ties are broken alphabetically.
     """
     verbs = annotated.hand_types["verb"]
     trained, tested = (
@@ -99,7 +102,7 @@ def majority_verb(annotated: AnnotatedStore) -> list[tuple[str, str]]:
     )
     if not trained or not tested:
         return []
-    verb = min(trained, key=lambda own: (-trained.count(own), own))
+    verb = min(trained, key=lambda name: (-trained.count(name), name))
     return [(f"{tested.count(verb) / len(tested):.0%}", f"of test clips show the most frequent training verb, {verb}")]
 
 
@@ -107,7 +110,7 @@ def _counts(store: Store, annotated: AnnotatedStore | None) -> list[tuple[str, l
     rows = store.sequences
     tables = []
     if annotated is not None:
-        tables.append(("hands", _frequent(list(annotated.hand_types["hand_type"]), "none acts")))
+        tables.append(("hands", _frequent(list(annotated.hand_types["hand_type"]), "none is active")))
         tables.append(("split", _frequent([annotated.splits[clip_id] for clip_id in annotated.ids()], "none")))
     tables.append(("verb", _frequent(list(rows["verb"]), "no label in the source")))
     tables.append(("object", _frequent(list(rows["object_words"]), "unnamed")))

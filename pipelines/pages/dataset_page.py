@@ -1,4 +1,4 @@
-"""One dataset as one page: counts, lengths, examples, splits, quality control, what was left out, origin."""
+"""The page of one dataset: counts, lengths, examples, splits, quality control, skipped sequences, provenance."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -35,25 +35,25 @@ Rows = list[tuple[str, ...]]
 
 @dataclass(frozen=True)
 class Bar:
-    """name, how many clips, and per cent of the longest bar of its chart."""
+    """One bar of a chart of clip counts."""
 
     name: str
     clips: int
-    width: float
+    width: float  # percent of the longest bar
 
 
 @dataclass(frozen=True)
 class Bars:
-    """A bar chart, most clips first; rest: what is not shown, "" where everything is."""
+    """A chart of clip counts, most clips first."""
 
     title: str
     bars: list[Bar]
-    rest: str = ""
+    rest: str = ""  # the values without a bar, in words
 
 
 @dataclass(frozen=True)
 class Example:
-    """One clip as a still, with a link to the page that plays it."""
+    """One clip as a still image, with a link to its page."""
 
     still: Player
     sentence: str
@@ -62,18 +62,14 @@ class Example:
 
 
 class ObjectContact(NamedTuple):
-    """One object, or all of them, over its clips, as texts; "not measured" where nothing can be inside.
-
-    touching: share of frames in which a joint is within the threshold of a sampled point. deep: share of the frames
-    that quality control looked at in which a hand vertex is too deep inside. deepest: depth of the deepest vertex, mm.
-    """
+    """Contact and penetration of one object, or of all objects, as texts; "not measured" if the object is not solid."""
 
     name: str
     clips: str
     frames: str
-    touching: str
-    deep: str
-    deepest: str
+    touching: str  # percentage of frames with a joint within the threshold of a sampled point
+    deep: str  # percentage of measured frames with a hand vertex too deep inside
+    deepest: str  # depth of the deepest vertex, mm
 
 
 def write_dataset_page(
@@ -81,8 +77,12 @@ def write_dataset_page(
 ) -> Path:
     """Write ``out/<name>.html`` and, for its examples, ``out/clips/<clip>.html``; equal inputs give equal bytes.
 
-    root: the folder of the dataset's stages. examples: at most so many. Raises MissingResource with the reason for a
-    dataset without clips, or naming a stage that has not run.
+    Args:
+        root: the folder with the outputs of the dataset's stages.
+        examples: the largest number of examples.
+
+    Raises:
+        MissingResource: the dataset has no clips, or a stage has not run; the message says which.
     """
     facts = read_dataset(root, name, hands)
     if facts.empty:
@@ -102,14 +102,14 @@ def write_dataset_page(
         quality=read_quality(root / "quality", name),
         contact=contact_by_object(annotated),
         threshold_cm=annotated.contact_threshold_m * 100,
-        without_words=without_words(annotated),
+        without_sentences=clips_without_sentences(annotated),
         provenance=fact_rows(annotated.store),
         has_players=True,
     )
 
 
 def can_be_shown(root: Path) -> bool:
-    """Whether the stages have left all that the page of a dataset and those of its clips need."""
+    """Whether the stages have written all files that the page of a dataset and those of its clips need."""
     return has_tables(root, "quality/clips.parquet")
 
 
@@ -118,7 +118,7 @@ def count_charts(annotated: AnnotatedStore) -> list[Bars]:
     rows = annotated.store.sequences
     chosen = annotated.split_info["chosen"]["name"]
     return [
-        count_bars("hand type", annotated.hand_types["hand_type"].tolist(), "none acts"),
+        count_bars("hand type", annotated.hand_types["hand_type"].tolist(), "none is active"),
         count_bars(f"part of the split {chosen}", list(annotated.splits.values()), "none"),
         count_bars("verb", rows["verb"].tolist(), UNLABELLED),
         count_bars("object", rows["object_words"].tolist(), "unnamed"),
@@ -127,7 +127,7 @@ def count_charts(annotated: AnnotatedStore) -> list[Bars]:
 
 
 def count_bars(title: str, column: Sequence[object], missing: str) -> Bars:
-    """How often each value occurs, most frequent first, equal ones by name; the ones beyond 24 as one sentence."""
+    """The number of clips per value, most frequent first, ties in alphabetical order; at most 24 bars."""
     names = [missing if pd.isna(value) else str(value) for value in column]  # pyright: ignore[reportGeneralTypeIssues]
     counted = sorted(Counter(names).items(), key=lambda item: (-item[1], item[0]))
     shown, others = counted[:SHOWN_BARS], counted[SHOWN_BARS:]
@@ -161,7 +161,7 @@ def lengths_svg(annotated: AnnotatedStore, salt: str) -> str:
 
 
 def example_ids(annotated: AnnotatedStore, count: int) -> list[str]:
-    """Up to ``count`` clips with sentences, each the one with most that is new (hand, verb, object, subject)."""
+    """Up to ``count`` clips with sentences, chosen greedily for new hand types, verbs, objects and subjects."""
     rows = annotated.store.sequences.loc[annotated.ids()]
     columns = [rows[name].tolist() for name in ("verb", "object", "subject")]
     hand_types = annotated.hand_types["hand_type"]
@@ -179,7 +179,7 @@ def example_ids(annotated: AnnotatedStore, count: int) -> list[str]:
 
 
 def _examples(out: str | Path, annotated: AnnotatedStore, hands: HandPair, count: int) -> list[Example]:
-    """Stills of the examples; the page of each is written beside."""
+    """Stills of the examples; writes the page of each."""
     examples = []
     for clip_id in example_ids(annotated, count):
         link = f"{CLIP_FOLDER}/{page_name(clip_id)}"
@@ -190,7 +190,7 @@ def _examples(out: str | Path, annotated: AnnotatedStore, hands: HandPair, count
 
 
 def still_of(annotated: AnnotatedStore, clip_id: str, hands: HandPair, title: str) -> Player:
-    """The clip in the frame in which most points are touched, with its contact map; without a legend."""
+    """The clip in the frame with the most touched points, with its contact map, without a legend."""
     clip, frame = annotated.clip(clip_id), _busiest_frame(annotated, clip_id)
     still = motion_player(clip.take(slice(frame, frame + 1)), hands, title, contact=true_contact(annotated, clip_id))
     return replace(still, legend=(), contact_label="")
@@ -206,7 +206,7 @@ def _busiest_frame(annotated: AnnotatedStore, clip_id: str) -> int:
 
 
 def split_rows(annotated: AnnotatedStore) -> Rows:
-    """Of every named split: (name, train, validation, test, left out, whether it keeps its promises)."""
+    """Per named split: (name, train, validation, test, excluded, whether it passes its leak checks)."""
     info = annotated.split_info
     chosen = info["chosen"]["name"]
     records = {f"{chosen} (chosen)": info["chosen"]}
@@ -221,22 +221,22 @@ def split_rows(annotated: AnnotatedStore) -> Rows:
     ]
 
 
-def without_words(annotated: AnnotatedStore) -> Rows:
-    """(clip, why) of every clip that got no sentences."""
-    named = set(annotated.ids())
-    rows = zip(annotated.hand_types["clip_id"].tolist(), annotated.hand_types["reason"].tolist(), strict=True)
-    return [(str(clip_id), str(reason)) for clip_id, reason in rows if clip_id not in named]
+def clips_without_sentences(annotated: AnnotatedStore) -> Rows:
+    """(clip, reason) of every clip without sentences."""
+    described = set(annotated.ids())
+    reasons = zip(annotated.hand_types["clip_id"].tolist(), annotated.hand_types["reason"].tolist(), strict=True)
+    return [(str(clip_id), str(reason)) for clip_id, reason in reasons if clip_id not in described]
 
 
 def contact_by_object(annotated: AnnotatedStore) -> list[ObjectContact]:
-    """Every object by name, after all of them together where there are several."""
-    rows = annotated.store.sequences[["clip_id", "object", "n_frames"]].reset_index(drop=True)
-    rows["touching"] = [len(np.unique(annotated.distances(clip_id).frame)) for clip_id in rows["clip_id"]]
+    """One entry per object in alphabetical order, preceded by one for all objects if there are several."""
+    clips = annotated.store.sequences[["clip_id", "object", "n_frames"]].reset_index(drop=True)
+    clips["touching"] = [len(np.unique(annotated.distances(clip_id).frame)) for clip_id in clips["clip_id"]]
     measures = ["clip_id", "penetration_m", "penetration_share"]
     depths = read_table(Path(annotated.root) / "quality" / "clips.parquet", measures)
-    rows = rows.merge(depths, on="clip_id", how="left", validate="one_to_one")
-    found = [_contact_row(str(name), group) for name, group in rows.groupby("object")]
-    return [_contact_row("all objects", rows), *found] if len(found) > 1 else found
+    clips = clips.merge(depths, on="clip_id", how="left", validate="one_to_one")
+    objects = [_contact_row(str(name), group) for name, group in clips.groupby("object")]
+    return [_contact_row("all objects", clips), *objects] if len(objects) > 1 else objects
 
 
 def _contact_row(name: str, rows) -> ObjectContact:

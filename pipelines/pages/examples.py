@@ -1,4 +1,4 @@
-"""What the report shows of one dataset: which held-out clips, and the motions families made in their place."""
+"""Examples on the report: held-out clips and the motions that families generated for them."""
 
 from pathlib import Path
 
@@ -14,12 +14,12 @@ from pipelines.pages.surface import ContactPaint
 
 
 def shown_subset(annotated: AnnotatedStore) -> str:
-    """The subset that examples are of: test, else validation, else train; "" without clips."""
+    """The subset of the examples: test, else validation, else train; "" without clips."""
     return next((subset for subset in reversed(SUBSETS) if annotated.ids(subset)), "")
 
 
 def shown_ids(annotated: AnnotatedStore, count: int) -> list[str]:
-    """Up to ``count`` clips of ``shown_subset``, of different objects first."""
+    """Up to ``count`` clips of ``shown_subset``, one per object first."""
     subset = shown_subset(annotated)
     ids = annotated.ids(subset) if subset else []
     first_of_object = list({annotated.object_key(clip_id): clip_id for clip_id in reversed(ids)}.values())[::-1]
@@ -28,13 +28,13 @@ def shown_ids(annotated: AnnotatedStore, count: int) -> list[str]:
 
 
 def true_contact(annotated: AnnotatedStore, clip_id: str) -> ContactPaint:
-    """Points any hand touches in any frame of the clip."""
+    """The recorded contact map: points that any hand touches in any frame of the clip."""
     points = annotated.points(annotated.object_key(clip_id))
     return ContactPaint(points.points_m, points.part, annotated.contact(clip_id).astype(np.float64))
 
 
 def first_motion(samples: Path, clip_id: str, hands: HandPair) -> Clip | None:
-    """The first motion a family made in place of a clip, or None where it made none. samples: the family's folder."""
+    """The first motion in a family's folder ``samples`` for a clip, or None."""
     if not (samples / "clips" / "meta" / "info.json").is_file():
         return None
     store = open_store(samples / "clips", hands)
@@ -43,7 +43,7 @@ def first_motion(samples: Path, clip_id: str, hands: HandPair) -> Clip | None:
 
 
 def motion_contact(annotated: AnnotatedStore, clip_id: str, motion: Clip, hands: HandPair) -> ContactPaint:
-    """Points any hand of ``motion`` touches in any frame, found as the contact stage finds them in the clip."""
+    """Points that any hand of ``motion`` touches in any frame, by the rule of the contact stage."""
     points = annotated.points(annotated.object_key(clip_id))
     index = ProximityIndex(points)
     joints: dict[Side, np.ndarray] = {side: track_joints(motion.hands[side], hands[side]) for side in SIDES}

@@ -1,9 +1,9 @@
-"""A clip as one animated GLB that any glTF 2.0 viewer plays.
+"""Writes a clip as an animated GLB for any glTF 2.0 viewer.
 
-Hands are skinned meshes on MANO's 16 joints with the shape (mean betas of the valid frames, or the personal template)
-baked into the rest mesh. Two things are left out because glTF skins cannot say them: pose correctives, and all but the
-four strongest joint weights of a vertex (the embedded hand has no more). A hand that is never valid is not in the file;
-one that comes and goes is scaled to zero where it means nothing. The node "world" turns gravity to glTF's -y.
+Hands are skinned meshes on MANO's 16 joints. Their shape (mean betas of the valid frames, or the personal template) is
+baked into the rest mesh. glTF skins cannot represent pose correctives and more than four joint weights per vertex, so
+these are dropped; the embedded hand has neither. A hand without valid frames is not in the file, and a hand is scaled
+to zero in invalid frames. The node "world" rotates gravity to glTF's -y.
 """
 
 from collections.abc import Mapping
@@ -45,7 +45,7 @@ class GltfBuilder:
     def array(
         self, values: np.ndarray, target: int | None = None, bounds: bool = False, normalized: bool = False
     ) -> int:
-        """Add ``values`` (item,) or (item, component), float32, uint8 or uint32; give the accessor's index."""
+        """Add ``values`` (item,) or (item, component), float32, uint8 or uint32; returns the accessor's index."""
         values = np.ascontiguousarray(values)
         data = values.tobytes()
         view = gltf.BufferView(buffer=0, byteOffset=self._offset, byteLength=len(data), target=target)
@@ -131,10 +131,12 @@ def write_glb(
     ghosts: Mapping[Side, HandTrack] = MappingProxyType({}),
     extras: dict | None = None,
 ) -> Path:
-    """Write ``clip`` as an animated, self-contained GLB; ``contact`` is painted on the object. Repeatable.
+    """Write ``clip`` as an animated, self-contained GLB; equal inputs give equal bytes.
 
-    ghosts: hands to see through, to compare with those of the clip. extras: further facts for the asset's own, as JSON
-    values.
+    Args:
+        contact: colours the object.
+        ghosts: transparent hands, for comparison with those of the clip.
+        extras: JSON values for the asset's ``extras``.
     """
     return write_whole(path, glb_bytes(clip, hands, contact, ghosts, extras))
 
@@ -147,9 +149,11 @@ def glb_bytes(
     extras: dict | None = None,
     markers: Mapping[Side, np.ndarray] = MappingProxyType({}),
 ) -> bytes:
-    """The bytes of ``write_glb``; hands None: the objects alone.
+    """The bytes of ``write_glb``.
 
-    markers: (frame, 21, 3) world joints, metres, added as empty nodes called ``<side> joint <name>``.
+    Args:
+        hands: None for the objects alone.
+        markers: per side (frame, 21, 3) world joints, metres, added as empty nodes ``<side> joint <name>``.
     """
     facts = {"clip": clip.clip_id, "synthetic": clip.synthetic, "fps": FPS}
     builder = GltfBuilder(clip.clip_id, facts | (extras or {}))
@@ -171,7 +175,7 @@ def glb_bytes(
 
 
 def upright_rotation(gravity: np.ndarray | None) -> Rotation:
-    """The smallest rotation that turns ``gravity`` to -y; none when the clip does not know where down is."""
+    """The smallest rotation from ``gravity`` to -y; identity if gravity is unknown."""
     if gravity is None:
         return Rotation.identity()
     down, target = np.asarray(gravity, dtype=np.float64), np.array((0.0, -1.0, 0.0))
@@ -283,7 +287,7 @@ def _add_part(
     colour: tuple[float, float, float],
     contact: ContactPaint | None,
 ) -> None:
-    """Hang one rigid part of the object on its node; the moving part's vertices are taken from the hinge origin."""
+    """Attach one rigid part of the object to its node; vertices of the moving part are relative to the hinge origin."""
     if len(faces) == 0:
         return
     used, compact = np.unique(faces, return_inverse=True)
@@ -323,5 +327,5 @@ def continuous_quaternions(rotvec: np.ndarray) -> np.ndarray:
 
 
 def linear_from_srgb(colour: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1] to linear light (IEC 61966-2-1), as glTF wants its colours."""
+    """sRGB in [0, 1] to linear light (IEC 61966-2-1), the colour space of glTF."""
     return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)

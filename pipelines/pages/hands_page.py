@@ -1,4 +1,4 @@
-"""What hands for a motion of an object are written as: motion.npz, motion.glb and a page that plays all samples."""
+"""Writes hands generated for an object motion: motion.npz, motion.glb and a page that plays all samples."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,14 @@ from hoidata.object_paths.path import PathStep
 from models.bimart.hands import TOUCH_M, MadeHands, Standing
 from pipelines.pages.glb import HAND_COLOURS
 from pipelines.pages.motion_files import ARRAYS as SHARED
-from pipelines.pages.motion_files import MotionFiles, clip_joints_m, drawn, mesh_arrays, motion_arrays, write_motions
+from pipelines.pages.motion_files import (
+    MotionFiles,
+    clip_joints_m,
+    mesh_arrays,
+    motion_arrays,
+    simplified_for_page,
+    write_motions,
+)
 from pipelines.pages.player import Player, contact_player, css_colour, motion_player
 from pipelines.pages.surface import ContactPaint
 
@@ -25,23 +32,23 @@ FADES_M = 0.02  # where paint ends
 # Every array of motion.npz. Axes: S = 2 sides (left, right), F frames, P object points.
 ARRAYS = SHARED | {
     "checkpoints": "JSON: SHA-256 of each network's file by its path; `hoidata lineage motion.npz` reads it",
-    "seed": "what the motion was drawn from",
+    "seed": "the random seed of the motion",
     "before_joints_m": "(S, F, 21, 3) the joints before refinement",
     "touching": "(S, F) whether a vertex of the hand is within 5 mm of the surface",
-    "contact_points_m": "(P, 3) points of the object, in its own frame",
+    "contact_points_m": "(P, 3) points of the object, in its frame",
     "contact_part": "(P,) 1 where the hinge moves the point",
     "contact_distance_m": "(S, F, P) float16 distance of each point to the nearest vertex of the hand",
-    "asked_distance_m": "(S, P) the least of them over all frames, as the contact model asked; infinite: not looked at",
+    "asked_distance_m": "(S, P) the target of the contact model for the least distance over all frames; infinite: none",
 }
 
 
 @dataclass(frozen=True)
 class Strip:
-    """Bars over the time of the motion. bars: (start, width) in per cent, with what they say."""
+    """Bars over the time of the motion."""
 
     name: str
     colour: str
-    bars: list[tuple[float, float, str]]
+    bars: list[tuple[float, float, str]]  # start and width in percent, label
 
 
 def write_hands(
@@ -53,14 +60,16 @@ def write_hands(
     facts: Sequence[tuple[str, str]],
     notes: Sequence[str] = (),
 ) -> list[Path]:
-    """Write motion.npz, motion.glb (for further motions motion-1.npz, ...) and index.html; gives their paths.
+    """Write motion.npz, motion.glb (further motions: motion-1.npz, ...) and index.html; returns their paths.
 
-    steps: what the object does when. made_from: digests of the networks by their files.
+    Args:
+        steps: the steps of the object trajectory.
+        made_from: digests of the networks by file.
     """
     first, files = motions[0], []
     for motion in motions:
         arrays, paint = hands_arrays(motion, hands, made_from), _paint(motion, motion.reached_m.min(axis=(0, 1)))
-        files.append(MotionFiles(motion.clip, arrays, paint, {}, made_from, motion.number))
+        files.append(MotionFiles(motion.clip, arrays, paint, checkpoints=made_from, number=motion.number))
     length = f"{first.clip.n_frames} frames, {first.clip.n_frames / FPS:.2f} s at {FPS} fps"
     digests = ", ".join(f"{Path(path).parent.name} {digest[:12]}" for path, digest in made_from.items())
     return write_motions(
@@ -69,7 +78,7 @@ def write_hands(
         files,
         hands,
         ARRAYS,
-        "how near the hands come",
+        "the least distance of the hands",
         title=f"Hands for {first.clip.object_words}",
         notes=list(notes),
         touch_mm=round(1000 * TOUCH_M),
@@ -80,7 +89,7 @@ def write_hands(
 
 
 def hands_arrays(motion: MadeHands, hands: HandPair, made_from: Mapping[str, str]) -> dict[str, np.ndarray]:
-    """The arrays of motion.npz, as ``ARRAYS`` explains them."""
+    """The arrays of motion.npz (``ARRAYS``)."""
     touching = motion.standing.touching
     nothing = np.zeros(motion.clip.n_frames, bool)
     return {
@@ -98,40 +107,41 @@ def hands_arrays(motion: MadeHands, hands: HandPair, made_from: Mapping[str, str
 
 
 def _shown(motion: MadeHands, hands: HandPair, steps: Sequence[PathStep]) -> dict[str, Any]:
-    """One motion on the page. maps: by hand, the contact map asked for and the one reached, and how far they agree."""
+    """The content of the page for one motion."""
     caption = f"sample {motion.number + 1}"
     title = f"{caption}: hands for {motion.clip.object_words}"
     paint, words = _paint(motion, motion.reached_m.min(axis=(0, 1))), f"a hand comes within {100 * FADES_M:.0f} cm"
     return {
         "caption": caption,
-        "player": motion_player(drawn(motion.clip), hands, title, caption, paint, words),
-        "before": motion_player(drawn(motion.before), hands, f"{title}, before refinement", caption),
+        "player": motion_player(simplified_for_page(motion.clip), hands, title, caption, paint, words),
+        "before": motion_player(simplified_for_page(motion.before), hands, f"{title}, before refinement", caption),
         "strips": _strips(motion, steps),
         "maps": [_map(motion, side, title) for side in motion.standing.touching],
-        "figures": _figures(motion.standing_before, motion.standing),
+        "measures": _measures(motion.standing_before, motion.standing),
     }
 
 
-def _map(motion: MadeHands, side: Side, title: str) -> tuple[str, Player, Player, str]:
-    row = SIDES.index(side)
-    asked, reached = motion.asked_m[row], motion.reached_m[row].min(axis=0)
-    still = drawn(motion.clip, FACES_OF_STILLS)
-    paints = {"asked for": _paint(motion, asked), "reached": _paint(motion, reached)}
+def _map(motion: MadeHands, side: Side, title: str) -> tuple[Player, Player, str]:
+    """Players of the target and the generated contact map of one hand, and their agreement in words."""
+    side_index = SIDES.index(side)
+    target_m, reached_m = motion.asked_m[side_index], motion.reached_m[side_index].min(axis=0)
+    still = simplified_for_page(motion.clip, FACES_OF_STILLS)
+    paints = {"target": _paint(motion, target_m), "generated": _paint(motion, reached_m)}
     first, second = (
-        contact_player(still, paint, f"{title}, {side} hand, {name}", f"{side} hand, {name}", name, paints["reached"])
+        contact_player(still, paint, f"{title}, {side} hand, {name}", f"{side} hand, {name}", name, paints["generated"])
         for name, paint in paints.items()
     )
-    near = asked < FADES_M
+    near = target_m < FADES_M
     if not near.any():
-        return side, first, second, f"{side} hand: it was not asked to come near the object"
-    off = 100 * np.abs(asked - reached)[near].mean()
-    share = 100 * (reached[near] < FADES_M).mean()
-    words = f"{near.sum()} points were to be neared to {100 * FADES_M:.0f} cm, {share:.0f} % of them were"
-    return side, first, second, f"{side} hand: {words}; distances differ by {off:.1f} cm on average"
+        return first, second, f"{side} hand: no target contact"
+    error_cm = 100 * np.abs(target_m - reached_m)[near].mean()
+    percent = 100 * (reached_m[near] < FADES_M).mean()
+    words = f"{near.sum()} target points within {100 * FADES_M:.0f} cm, {percent:.0f} % reached"
+    return first, second, f"{side} hand: {words}; distances differ by {error_cm:.1f} cm on average"
 
 
 def _paint(motion: MadeHands, distance_m: np.ndarray) -> ContactPaint:
-    """Full where a hand touches, fading to where it stays 2 cm away; distance_m: (point,)."""
+    """1 where a hand touches, fading to 0 at a distance of 2 cm; distance_m: (point,)."""
     value = np.clip((FADES_M - distance_m) / (FADES_M - TOUCH_M), 0, 1)
     return ContactPaint(motion.points.points_m, motion.points.part, value)
 
@@ -150,7 +160,7 @@ def _strips(motion: MadeHands, steps: Sequence[PathStep]) -> list[Strip]:
 
 
 def _runs(mask: np.ndarray) -> list[tuple[float, float, str]]:
-    """Start and width, per cent, of each interval in which ``mask (frame,)`` holds."""
+    """Start and width in percent, and the time in words, of each interval in which ``mask`` (frame,) is true."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], mask.astype(np.int8), [0]))))
     return [
         (100 * start / len(mask), 100 * (stop - start) / len(mask), f"{start / FPS:.2f} to {stop / FPS:.2f} s")
@@ -158,17 +168,20 @@ def _runs(mask: np.ndarray) -> list[tuple[float, float, str]]:
     ]
 
 
-def _figures(before: Standing, after: Standing) -> list[tuple[str, ...]]:
-    """Rows (name, before, after)."""
-    rows: list[tuple[str, ...]] = [
-        (f"{side} hand touches", *(f"{100 * own.touching[side].mean():.0f} % of frames" for own in (before, after)))
+def _measures(before: Standing, after: Standing) -> list[tuple[str, ...]]:
+    """(name, before, after) of contact, depth and acceleration."""
+    measures: list[tuple[str, ...]] = [
+        (
+            f"{side} hand touches",
+            *(f"{100 * contact.touching[side].mean():.0f} % of frames" for contact in (before, after)),
+        )
         for side in after.touching
     ]
-    depths = [own.deepest_m for own in (before, after)]
+    depths = [contact.deepest_m for contact in (before, after)]
     for name, words in (
         ("deepest vertex", lambda depth_m: f"{1000 * depth_m.max():.1f} mm"),
         ("frames deeper than 1 cm", lambda depth_m: f"{100 * (depth_m > 0.01).mean():.0f} %"),
     ):
-        rows.append((name, *(f"not measured: {NO_INSIDE.reason}" if d is None else words(d) for d in depths)))
-    rows.append(("mean acceleration", *(f"{own.acceleration_m_s2:.2f} m/s²" for own in (before, after))))
-    return rows
+        measures.append((name, *(f"not measured: {NO_INSIDE.reason}" if d is None else words(d) for d in depths)))
+    measures.append(("mean acceleration", *(f"{contact.acceleration_m_s2:.2f} m/s²" for contact in (before, after))))
+    return measures

@@ -1,4 +1,4 @@
-"""What evaluation found, as tables and charts: rows are families and controls, columns the registered metrics."""
+"""Metrics files as tables and charts: one line per method (family or control), one column per registered metric."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,22 +10,22 @@ from rich import box
 from rich.table import Table
 
 from hoidata.errors import BadInput
-from hoidata.metrics.asked_metrics import ASKED_LISTS
 from hoidata.metrics.feature_metrics import FEATURE_METRICS, FeatureMetric
+from hoidata.metrics.optional_metrics import OPTIONAL_LISTS
 from hoidata.metrics.registry import METRICS, Metric, is_better
 from hoidata.metrics.unmeasured import reasons_in_words
-from pipelines.figures import read_metrics
-from pipelines.promises import TRUTH
+from pipelines.expected_orderings import RECORDED
+from pipelines.metrics_files import read_metrics
 
 AnyMetric = Metric | FeatureMetric
 ALL_METRICS: tuple[AnyMetric, ...] = (
     *METRICS,
     *FEATURE_METRICS,
-    *(row for rows in ASKED_LISTS.values() for row in rows),
+    *(metric for metrics in OPTIONAL_LISTS.values() for metric in metrics),
 )
-LOOKUPS = ("nearest-clip", "verb-lookup", "verb-lookup-held", "prompt-lookup", "prompt-lookup-held")
+RETRIEVAL_BASELINES = ("nearest-clip", "verb-lookup", "verb-lookup-held", "prompt-lookup", "prompt-lookup-held")
 CONTROLS = "controls"
-NO_FIGURE = "-"  # the metric was not computed of this row
+NOT_COMPUTED = "-"
 NOT_MEASURED = "not measured"
 OTHER_EVALUATOR = "another evaluator"
 INTERVALS = {"clips": "95 %, clips", "repetitions": "95 %, repetitions"}
@@ -33,145 +33,134 @@ INTERVALS = {"clips": "95 %, clips", "repetitions": "95 %, repetitions"}
 
 @dataclass(frozen=True)
 class Cell:
-    """A figure in text. mark: "good" for the best of all families, "bad" where it loses to a lookup, else "".
-
-    spread: its 95 % interval over clips, in text; note: why there is no figure, or what it leaves out. share: how many
-    of the clips it is of, in text; "" where it is of all.
-    """
+    """The value of a metric for one method, as text."""
 
     text: str
-    mark: str = ""
-    spread: str = ""
-    note: str = ""
-    share: str = ""
+    mark: str = ""  # "good": the best of all methods; "bad": worse than a retrieval baseline
+    spread: str = ""  # 95 % interval over clips
+    note: str = ""  # a remark, or why the value is missing
+    coverage: str = ""  # "25 of 28": clips with a value; "" for all
 
 
 @dataclass(frozen=True)
 class Bar:
-    """One row of a chart, in percent of its width. clips, repetitions: ends of intervals; kind: for the colour."""
+    """One method in a chart; positions are in percent of the width."""
 
     family: str
-    kind: str
+    kind: str  # of the method, selects the colour
     at: float
-    clips: tuple[float, float] | None
-    repetitions: tuple[float, float] | None
+    clips: tuple[float, float] | None  # interval over clips
+    repetitions: tuple[float, float] | None  # interval over repetitions
     text: str
 
 
 @dataclass(frozen=True)
 class Chart:
-    """One metric with a bar for every row that has a figure. ends: what 0 and 100 percent stand for, in text.
-
-    missing: the rows of which it could not be measured, in words.
-    """
+    """One metric with a bar for every method that has a value."""
 
     title: str
     better: str
-    ends: tuple[str, str]
+    ends: tuple[str, str]  # the values at 0 and 100 percent, as text
     bars: list[Bar]
-    missing: str = ""
+    missing: str = ""  # the methods without a value, in words
 
 
 @dataclass(frozen=True)
 class Topic:
-    """Metrics that belong together. columns: (title, unit, which are better); cells: a list for each row.
-
-    unmeasured: (titles, reasons and counts in words) of the metrics that no row has a figure of.
-    """
+    """The table of the metrics of one topic."""
 
     title: str
-    columns: list[tuple[str, str, str]]
-    cells: list[list[Cell]]
+    columns: list[tuple[str, str, str]]  # (title, unit, which values are better)
+    cells: list[list[Cell]]  # by method, by column
     charts: list[Chart]
-    unmeasured: list[tuple[str, str]]
+    unmeasured: list[tuple[str, str]]  # (titles, reasons and counts) of metrics without a value for any method
 
 
 @dataclass(frozen=True)
-class Row:
-    """One family. kind: "truth", "lookup", "control" or "family". words: how often it loses to which lookup.
-
-    lost: by lookup, titles of the metrics in which it loses, in words. empty: why it has no figures.
-    diagnostics: what the family says of its own networks, as (name, value).
-    """
+class Method:
+    """One evaluated family or control."""
 
     family: str
-    kind: str = "family"
-    words: str = ""
-    lost: list[str] = field(default_factory=list)
-    empty: str = ""
-    note: str = ""
-    diagnostics: list[tuple[str, str]] = field(default_factory=list)
+    kind: str = "family"  # "recorded", "retrieval", "control" or "family"
+    summary: str = ""  # in how many metrics it is worse than which retrieval baseline
+    worse_in: list[str] = field(default_factory=list)  # per retrieval baseline, the titles of these metrics
+    empty: str = ""  # why there are no metrics
+    note: str = ""  # number of motions and clips
+    diagnostics: list[tuple[str, str]] = field(default_factory=list)  # (name, value) of the family's own networks
 
 
 @dataclass(frozen=True)
 class MetricsTable:
-    """All families and controls of one dataset."""
+    """All methods of one dataset."""
 
-    rows: list[Row]
+    methods: list[Method]
     topics: list[Topic]
 
 
 @dataclass(frozen=True)
-class _Found:
-    """What evaluation wrote of every row: the JSON files, by family; which of them are controls."""
+class _Files:
+    """The metrics files of all methods."""
 
-    values: Mapping[str, Mapping[str, Any]]
+    contents: Mapping[str, Mapping[str, Any]]  # by family
     controls: frozenset[str] = frozenset()
 
     def kind(self, family: str) -> str:
-        """What a row is: "truth", "lookup", "control" or "family"."""
-        if family == TRUTH:
-            return "truth"
-        return "lookup" if family in LOOKUPS else "control" if family in self.controls else "family"
+        """The kind of a method: "recorded", "retrieval", "control" or "family"."""
+        if family == RECORDED:
+            return "recorded"
+        return "retrieval" if family in RETRIEVAL_BASELINES else "control" if family in self.controls else "family"
 
     def column(self, metric: AnyMetric) -> dict[str, float]:
-        """The figure of every family that has one and whose evaluator is the one of the others."""
-        found = {name: own["figures"][metric.name] for name, own in self.values.items() if self.has(name, metric)}
-        return {name: value for name, value in found.items() if not self.is_foreign(name, metric)}
+        """The comparable values of a metric by family."""
+        values = {
+            family: content["figures"][metric.name]
+            for family, content in self.contents.items()
+            if self.has(family, metric)
+        }
+        return {family: value for family, value in values.items() if not self.is_foreign(family, metric)}
 
     def has(self, family: str, metric: AnyMetric) -> bool:
-        return self.values[family].get("figures", {}).get(metric.name) is not None
+        return self.contents[family].get("figures", {}).get(metric.name) is not None
 
     def is_foreign(self, family: str, metric: AnyMetric) -> bool:
-        """Whether the figure comes from other weights than the first family's: they are not to be compared."""
+        """Whether the value comes from other evaluator weights than the first family's, so they cannot be compared."""
         if not isinstance(metric, FeatureMetric):
             return False
-        digests = {name: self._digest(name, metric.encoder) for name in self.values if self.has(name, metric)}
+        digests = {name: self._digest(name, metric.encoder) for name in self.contents if self.has(name, metric)}
         return digests[family] != next(iter(digests.values())) if family in digests else False
 
     def _digest(self, family: str, encoder: str) -> str:
-        return self.values[family].get("evaluators", {}).get(encoder, {}).get("digest", "")
+        return self.contents[family].get("evaluators", {}).get(encoder, {}).get("digest", "")
 
     def interval(self, family: str, metric: AnyMetric, kind: str) -> tuple[float, float] | None:
-        ends = self.values[family].get("intervals", {}).get(metric.name, {}).get(kind)
+        ends = self.contents[family].get("intervals", {}).get(metric.name, {}).get(kind)
         return (ends[0], ends[1]) if ends else None
 
     def note(self, family: str, metric: AnyMetric) -> str:
-        return str(self.values[family].get("notes", {}).get(metric.name, ""))
+        return str(self.contents[family].get("notes", {}).get(metric.name, ""))
 
     def unmeasured(self, family: str, metric: AnyMetric) -> dict[str, int]:
-        """How many clips of a row have no value of a metric, by reason."""
-        return self.values[family].get("unmeasured", {}).get(metric.name, {})
+        """The number of clips of a method without a value of a metric, by reason."""
+        return self.contents[family].get("unmeasured", {}).get(metric.name, {})
 
-    def share(self, family: str, metric: AnyMetric) -> str:
-        """``25 of 28``: clips with a value of those that were compared; "" where all have one."""
+    def coverage(self, family: str, metric: AnyMetric) -> str:
+        """``25 of 28``: clips with a value of the compared clips; "" if all have one."""
         missing = sum(self.unmeasured(family, metric).values())
-        clips = self.values[family].get("counts", {}).get(metric.name, {}).get("clips", 0)
+        clips = self.contents[family].get("counts", {}).get(metric.name, {}).get("clips", 0)
         return f"{clips:,} of {clips + missing:,}" if missing else ""
 
 
 def metrics_tables(folder: str | Path, families: Sequence[str]) -> MetricsTable:
-    """``folder/<family>.json``, families in the order given, then ``folder/controls``.
+    """The tables of ``folder/<family>.json`` in the given order, then ``folder/controls``.
 
-    A topic has a column for each metric with a figure in some row, and a line for each that could not be measured in
-    any; topics of which nothing was computed are left out.
+    A topic has a column for each metric with a value and a line for each unmeasured one. Empty topics are skipped.
     """
-    found = _found(Path(folder), families)
-    shown = [metric for metric in ALL_METRICS if any(found.has(name, metric) for name in found.values)]
-    never = [metric for metric in ALL_METRICS if metric not in shown and _reasons(metric, found)]
+    files = _read_files(Path(folder), families)
+    shown = [metric for metric in ALL_METRICS if any(files.has(family, metric) for family in files.contents)]
+    never = [metric for metric in ALL_METRICS if metric not in shown and _reasons(metric, files)]
     titles = dict.fromkeys(metric.topic for metric in ALL_METRICS if metric in shown or metric in never)
-    topics = [_topic(title, *(_of_topic(title, some) for some in (shown, never)), found=found) for title in titles]
-    return MetricsTable([_row(name, found, shown) for name in found.values], topics)
+    topics = [_topic(title, _of_topic(title, shown), _of_topic(title, never), files) for title in titles]
+    return MetricsTable([_method(family, files, shown) for family in files.contents], topics)
 
 
 def _of_topic(title: str, metrics: list[AnyMetric]) -> list[AnyMetric]:
@@ -179,186 +168,217 @@ def _of_topic(title: str, metrics: list[AnyMetric]) -> list[AnyMetric]:
 
 
 def markdown_table(folder: str | Path, families: Sequence[str], names: Sequence[str]) -> str:
-    """The metrics ``names`` of every row that was evaluated, as Markdown; what loses to a lookup says so in its cell.
+    """The metrics ``names`` of every evaluated method as a Markdown table.
 
-    Below the table: why rows were not evaluated, and why metrics could not be measured. Raises BadInput for a name no
-    metric has.
+    Cells that are worse than a retrieval baseline say so. Reasons of methods that were not evaluated and of unmeasured
+    metrics follow below the table. Raises BadInput for an unknown metric.
     """
-    found, known = _found(Path(folder), families), {metric.name: metric for metric in ALL_METRICS}
-    if unknown := [name for name in names if name not in known]:
-        raise BadInput("metric", f"one of {', '.join(known)}", ", ".join(unknown), "correct the name")
-    metrics = [known[name] for name in names]
-    heads = [f"{own.title}{', ' * bool(own.unit)}{own.unit} ({_better(own)})" for own in metrics]
-    lines = [f"| row | {' | '.join(heads)} |", "|---" * (len(metrics) + 1) + "|"]
+    files, by_name = _read_files(Path(folder), families), {metric.name: metric for metric in ALL_METRICS}
+    if unknown := [name for name in names if name not in by_name]:
+        raise BadInput("metric", f"one of {', '.join(by_name)}", ", ".join(unknown), "correct the name")
+    metrics = [by_name[name] for name in names]
+    heads = [f"{metric.title}{', ' * bool(metric.unit)}{metric.unit} ({_better(metric)})" for metric in metrics]
+    lines = [f"| method | {' | '.join(heads)} |", "|---" * (len(metrics) + 1) + "|"]
     below = []
-    for name, values in found.values.items():
-        if "figures" in values:
-            cells = [_cell(name, metric, found) for metric in metrics]
-            lines.append(f"| {name} | {' | '.join(_marked(cell, found.kind(name)) for cell in cells)} |")
+    for family, content in files.contents.items():
+        if "figures" in content:
+            cells = [_cell(family, metric, files) for metric in metrics]
+            lines.append(f"| {family} | {' | '.join(_marked(cell, files.kind(family)) for cell in cells)} |")
         else:
-            below.append(f"- {name}: not evaluated, {values['empty']}")
-    below += [f"- {own.title}: not measured, {words}" for own in metrics if (words := _reasons(own, found))]
+            below.append(f"- {family}: not evaluated, {content['empty']}")
+    below += [f"- {metric.title}: not measured, {words}" for metric in metrics if (words := _reasons(metric, files))]
     return "\n".join([*lines, *([""] if below else []), *below]) + "\n"
 
 
 def _marked(cell: Cell, kind: str) -> str:
-    share = f" ({cell.share} clips)" if cell.share else ""
-    return f"{cell.text}{share} (loses)" if cell.mark == "bad" and kind == "family" else f"{cell.text}{share}"
+    text = f"{cell.text} ({cell.coverage} clips)" if cell.coverage else cell.text
+    return f"{text} (worse than retrieval)" if cell.mark == "bad" and kind == "family" else text
 
 
-def _reasons(metric: AnyMetric, found: _Found) -> str:
-    """Why clips have no value of a metric, in words; rows with the same reasons and counts together."""
-    rows = defaultdict[str, list[str]](list)
-    for name in found.values:
-        if reasons := found.unmeasured(name, metric):
-            rows[reasons_in_words(reasons)].append(name)
-    measured = [name for name, values in found.values.items() if "figures" in values]
-    return "; ".join(words if names == measured else f"{', '.join(names)}: {words}" for words, names in rows.items())
+def _reasons(metric: AnyMetric, files: _Files) -> str:
+    """Why clips have no value of a metric, in words; methods with the same reasons and counts together."""
+    families_by_words = defaultdict[str, list[str]](list)
+    for family in files.contents:
+        if reasons := files.unmeasured(family, metric):
+            families_by_words[reasons_in_words(reasons)].append(family)
+    measured = [family for family, content in files.contents.items() if "figures" in content]
+    return "; ".join(
+        words if families == measured else f"{', '.join(families)}: {words}"
+        for words, families in families_by_words.items()
+    )
 
 
-def _found(folder: Path, families: Sequence[str]) -> _Found:
+def _read_files(folder: Path, families: Sequence[str]) -> _Files:
     controls = sorted(path.stem for path in (folder / CONTROLS).glob("*.json") if path.stem != "empty")
-    paths = {name: folder / f"{name}.json" for name in families}
-    paths |= {name: folder / CONTROLS / f"{name}.json" for name in controls if name not in paths}
-    return _Found({name: _read(path) for name, path in paths.items()}, frozenset(controls))
+    paths = {family: folder / f"{family}.json" for family in families}
+    paths |= {control: folder / CONTROLS / f"{control}.json" for control in controls if control not in paths}
+    return _Files({family: _read(path) for family, path in paths.items()}, frozenset(controls))
 
 
 def _read(path: Path) -> dict[str, Any]:
     return read_metrics(path) if path.is_file() else {"empty": "not evaluated"}
 
 
-def _row(family: str, found: _Found, shown: list[AnyMetric]) -> Row:
-    values, kind = found.values[family], found.kind(family)
-    if "figures" not in values:
-        return Row(family, kind, empty=str(values["empty"]))
-    columns = [(metric, found.column(metric)) for metric in shown]
-    lost = {name: [own.title for own, column in columns if loses_to(name, own, family, column)] for name in LOOKUPS}
-    lost = {name: titles for name, titles in lost.items() if titles and kind == "family"}
-    own = {name: sum(family in column and name in column for _, column in columns) for name in lost}
-    words = [f"loses to {name} in {len(titles)} of {own[name]} figures" for name, titles in lost.items()]
-    told = [f"to {name}: {', '.join(titles)}" for name, titles in lost.items()]
-    flat = _flat(values.get("diagnostics", {}))
-    diagnostics = [(name, NOT_MEASURED if value is None else number(value)) for name, value in flat.items()]
-    left_out = len(values.get("left_out", []))
-    note = f"{values['motions']:,} motions of {values['held_out_clips']:,} clips"
-    note += f", {left_out:,} left out" if left_out else ""
-    note += ", of lengths it chose itself" if values.get("length") == "own" else ""
-    return Row(family, kind, "; ".join(words), told, "", note, diagnostics)
+def _method(family: str, files: _Files, shown: list[AnyMetric]) -> Method:
+    content, kind = files.contents[family], files.kind(family)
+    if "figures" not in content:
+        return Method(family, kind, empty=str(content["empty"]))
+    columns = [(metric, files.column(metric)) for metric in shown]
+    summary, worse_in = [], []
+    for baseline in RETRIEVAL_BASELINES if kind == "family" else ():
+        titles = [metric.title for metric, column in columns if is_worse_than(baseline, metric, family, column)]
+        if titles:
+            compared = sum(family in column and baseline in column for _, column in columns)
+            summary.append(f"worse than {baseline} in {len(titles)} of {compared} metrics")
+            worse_in.append(f"worse than {baseline}: {', '.join(titles)}")
+    flat = _flat(content.get("diagnostics", {}))
+    skipped = len(content.get("left_out", []))
+    note = f"{content['motions']:,} motions of {content['held_out_clips']:,} clips"
+    note += f", {skipped:,} skipped" if skipped else ""
+    note += ", of estimated length" if content.get("length") == "own" else ""
+    return Method(
+        family=family,
+        kind=kind,
+        summary="; ".join(summary),
+        worse_in=worse_in,
+        note=note,
+        diagnostics=[(name, NOT_MEASURED if value is None else number(value)) for name, value in flat.items()],
+    )
 
 
-def _topic(title: str, metrics: list[AnyMetric], never: list[AnyMetric], found: _Found) -> Topic:
-    """metrics: those with a figure in some row; never: those that could not be measured in any."""
-    cells = [[_cell(name, metric, found) for metric in metrics] for name in found.values]
-    columns = [(metric.title, metric.unit, _better(metric)) for metric in metrics]
-    charts = [chart for metric in metrics if (chart := _chart(metric, found))]
+def _topic(title: str, metrics: list[AnyMetric], never: list[AnyMetric], files: _Files) -> Topic:
+    """The table of one topic.
+
+    Args:
+        metrics: those with a value for some method.
+        never: those that could not be measured for any method.
+    """
     titles = defaultdict[str, list[str]](list)
     for metric in never:
-        titles[_reasons(metric, found)].append(metric.title)
-    return Topic(title, columns, cells, charts, [("; ".join(own), words) for words, own in titles.items()])
+        titles[_reasons(metric, files)].append(metric.title)
+    return Topic(
+        title=title,
+        columns=[(metric.title, metric.unit, _better(metric)) for metric in metrics],
+        cells=[[_cell(family, metric, files) for metric in metrics] for family in files.contents],
+        charts=[chart for metric in metrics if (chart := _chart(metric, files))],
+        unmeasured=[("; ".join(same_reason), words) for words, same_reason in titles.items()],
+    )
 
 
-def _cell(family: str, metric: AnyMetric, found: _Found) -> Cell:
-    note, reasons = found.note(family, metric), reasons_in_words(found.unmeasured(family, metric))
-    if not found.has(family, metric):
-        return Cell(note or (NOT_MEASURED if reasons else NO_FIGURE), note=reasons)
-    if found.is_foreign(family, metric):
+def _cell(family: str, metric: AnyMetric, files: _Files) -> Cell:
+    note, reasons = files.note(family, metric), reasons_in_words(files.unmeasured(family, metric))
+    if not files.has(family, metric):
+        return Cell(note or (NOT_MEASURED if reasons else NOT_COMPUTED), note=reasons)
+    if files.is_foreign(family, metric):
         return Cell(OTHER_EVALUATOR)
-    column = found.column(metric)
-    loses = any(loses_to(lookup, metric, family, column) for lookup in LOOKUPS)
-    mark = "bad" if loses else "good" if family in best_families(metric, column) else ""
-    ends = found.interval(family, metric, "clips")
-    spread = f"{number(ends[0])} to {number(ends[1])}" if ends else ""
-    note = "; ".join(filter(None, (note, reasons and f"{NOT_MEASURED}: {reasons}")))
-    return Cell(number(column[family]), mark, spread, note, found.share(family, metric))
+    column = files.column(metric)
+    is_worse = any(is_worse_than(baseline, metric, family, column) for baseline in RETRIEVAL_BASELINES)
+    ends = files.interval(family, metric, "clips")
+    return Cell(
+        text=number(column[family]),
+        mark="bad" if is_worse else "good" if family in best_families(metric, column) else "",
+        spread=f"{number(ends[0])} to {number(ends[1])}" if ends else "",
+        note="; ".join(filter(None, (note, reasons and f"{NOT_MEASURED}: {reasons}"))),
+        coverage=files.coverage(family, metric),
+    )
 
 
-def _chart(metric: AnyMetric, found: _Found) -> Chart | None:
-    """All rows of one metric compared; None for fewer than two figures."""
-    column = found.column(metric)
+def _chart(metric: AnyMetric, files: _Files) -> Chart | None:
+    """All methods compared in one metric; None for fewer than two values."""
+    column = files.column(metric)
     if len(column) < 2:
         return None
-    spreads = {kind: {name: found.interval(name, metric, kind) for name in column} for kind in INTERVALS}
-    ends = [end for by_name in spreads.values() for pair in by_name.values() if pair for end in pair]
+    spreads = {kind: {family: files.interval(family, metric, kind) for family in column} for kind in INTERVALS}
+    ends = [end for by_family in spreads.values() for pair in by_family.values() if pair for end in pair]
     low, high = min(0.0, *column.values(), *ends), max(*column.values(), *ends)
     width = (high - low) or 1.0
 
     def percent(value: float) -> float:
         return round(100 * (value - low) / width, 2)
 
-    def span(kind: str, name: str) -> tuple[float, float] | None:
-        pair = spreads[kind][name]
+    def span(kind: str, family: str) -> tuple[float, float] | None:
+        pair = spreads[kind][family]
         return (percent(pair[0]), percent(pair[1])) if pair else None
 
     bars = [
-        Bar(name, found.kind(name), percent(value), span("clips", name), span("repetitions", name), number(value))
-        for name, value in column.items()
+        Bar(
+            family=family,
+            kind=files.kind(family),
+            at=percent(value),
+            clips=span("clips", family),
+            repetitions=span("repetitions", family),
+            text=number(value),
+        )
+        for family, value in column.items()
     ]
-    unit = f", {metric.unit}" if metric.unit else ""
-    missing = [name for name in found.values if name not in column and found.unmeasured(name, metric)]
-    words = f"{NOT_MEASURED}: {', '.join(missing)}" if missing else ""
-    return Chart(f"{metric.title}{unit}", _better(metric), (number(low), number(high)), bars, words)
+    missing = [family for family in files.contents if family not in column and files.unmeasured(family, metric)]
+    return Chart(
+        title=f"{metric.title}, {metric.unit}" if metric.unit else metric.title,
+        better=_better(metric),
+        ends=(number(low), number(high)),
+        bars=bars,
+        missing=f"{NOT_MEASURED}: {', '.join(missing)}" if missing else "",
+    )
 
 
 def best_families(metric: AnyMetric, column: Mapping[str, float]) -> list[str]:
-    """Families that no other beats in a metric; the truth itself does not compete."""
-    truth = column.get(TRUTH)
-    rivals = {name: value for name, value in column.items() if name != TRUTH}
-    if metric.floor_of or (metric.direction == "nearer the truth" and truth is None):
+    """Families that no other beats in a metric; the recorded clips do not compete."""
+    recorded = column.get(RECORDED)
+    rivals = {family: value for family, value in column.items() if family != RECORDED}
+    if metric.floor_of or (metric.direction == "closer to recorded" and recorded is None):
         return []
     return [
-        name
-        for name, value in rivals.items()
-        if not any(is_better(metric, other, value, truth) for other in rivals.values())
+        family
+        for family, value in rivals.items()
+        if not any(is_better(metric, other, value, recorded) for other in rivals.values())
     ]
 
 
-def loses_to(lookup: str, metric: AnyMetric, family: str, column: Mapping[str, float]) -> bool:
-    """Whether a training clip that was looked up gives a better figure than this family."""
-    if family in (TRUTH, *LOOKUPS) or lookup not in column or family not in column:
+def is_worse_than(baseline: str, metric: AnyMetric, family: str, column: Mapping[str, float]) -> bool:
+    """Whether a retrieval baseline has a better value than this family."""
+    if family in (RECORDED, *RETRIEVAL_BASELINES) or baseline not in column or family not in column:
         return False
-    return bool(is_better(metric, column[lookup], column[family], column.get(TRUTH)))
+    return bool(is_better(metric, column[baseline], column[family], column.get(RECORDED)))
 
 
-def printed_table(found: Mapping[str, Any]) -> Table:
-    """One system's figures for a terminal. found: what ``evaluate_store`` gives."""
-    title = f"{found['motions']:,} motions of {found['held_out_clips']:,} clips, {found.get('length', 'given')} length"
-    table = Table(title=title + (", synthetic" if found["synthetic"] else ""), box=box.SIMPLE)
+def printed_table(content: Mapping[str, Any]) -> Table:
+    """The result of ``evaluate_store`` as a table for a terminal."""
+    title = f"{content['motions']:,} motions of {content['held_out_clips']:,} clips, "
+    title += "estimated length" if content.get("length") == "own" else "given length"
+    table = Table(title=title + (", synthetic" if content["synthetic"] else ""), box=box.SIMPLE)
     table.add_column("metric", min_width=32)
-    for name in ("figure", *INTERVALS.values(), "unit", "better", "clips"):
+    for name in ("value", *INTERVALS.values(), "unit", "better", "clips"):
         table.add_column(name, justify="left" if name in ("unit", "better") else "right")
-    for row in _printed_rows(found):
-        table.add_row(*row)
+    for cells in _printed_rows(content):
+        table.add_row(*cells)
     return table
 
 
-def _printed_rows(found: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
-    own = _Found({"": found})
+def _printed_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    files = _Files({"": content})
     for metric in ALL_METRICS:
-        if not own.has("", metric):
-            missing = sum(own.unmeasured("", metric).values())
-            if text := own.note("", metric) or (NOT_MEASURED if missing else ""):
+        if not files.has("", metric):
+            missing = sum(files.unmeasured("", metric).values())
+            if text := files.note("", metric) or (NOT_MEASURED if missing else ""):
                 yield metric.title, text, "", "", metric.unit, _better(metric), f"0 of {missing:,}" if missing else ""
             continue
-        ends = [" to ".join(map(number, own.interval("", metric, kind) or ())) for kind in INTERVALS]
-        clips = own.share("", metric) or f"{found['counts'][metric.name]['clips']:,}"
-        figure = number(found["figures"][metric.name])
-        yield metric.title, figure, *ends, metric.unit, _better(metric), clips
+        ends = [" to ".join(map(number, files.interval("", metric, kind) or ())) for kind in INTERVALS]
+        clips = files.coverage("", metric) or f"{content['counts'][metric.name]['clips']:,}"
+        yield metric.title, number(content["figures"][metric.name]), *ends, metric.unit, _better(metric), clips
 
 
-def unmeasured_lines(found: Mapping[str, Any]) -> list[str]:
-    """For a terminal: of each metric without a value of some clip, the reasons and how many clips each has."""
-    reasons = {metric: _Found({"": found}).unmeasured("", metric) for metric in ALL_METRICS}
-    return [f"{NOT_MEASURED}: {metric.title}: {reasons_in_words(own)}" for metric, own in reasons.items() if own]
+def unmeasured_lines(content: Mapping[str, Any]) -> list[str]:
+    """Lines for a terminal: per metric without a value for some clip, the reasons and their numbers of clips."""
+    reasons = {metric: _Files({"": content}).unmeasured("", metric) for metric in ALL_METRICS}
+    return [f"{NOT_MEASURED}: {metric.title}: {reasons_in_words(count)}" for metric, count in reasons.items() if count]
 
 
 def _better(metric: AnyMetric) -> str:
-    if metric.floor_of:
-        return "a floor"
-    return metric.direction if metric.direction == "nearer the truth" else f"{metric.direction} is better"
+    return "lower bound" if metric.floor_of else f"{metric.direction} is better"
 
 
 def number(value: object) -> str:
-    """A figure as text: whole numbers as they are, others with three significant digits or more."""
+    """A value as text: whole numbers exactly, others with three significant digits or more."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return "" if value is None else str(value)
     if isinstance(value, int):
@@ -366,9 +386,10 @@ def number(value: object) -> str:
     return f"{value:,.1f}" if abs(value) >= 100 else f"{value:#.3g}"
 
 
-def _flat(figures: Mapping[str, Any], before: str = "") -> dict[str, object]:
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, object]:
+    """Nested values by their path in words."""
     flat: dict[str, object] = {}
-    for key, value in figures.items():
-        name = f"{before}{key}".replace("_", " ")
+    for key, value in values.items():
+        name = f"{prefix}{key}".replace("_", " ")
         flat |= _flat(value, f"{name} ") if isinstance(value, Mapping) else {name: value}
     return flat

@@ -1,5 +1,5 @@
-// Plays every figure.player of the page. One WebGL renderer serves them all (browsers allow only about 16 contexts):
-// each visible player is drawn in turn and copied to its own 2D canvas. THREE and GLTFLoader come from the page.
+// Plays all elements "figure.player" of the page. They share one WebGL renderer, because browsers allow about 16 contexts:
+// it renders each visible player, and the image is copied to that player's 2D canvas. The page provides THREE and GLTFLoader.
 "use strict";
 (function () {
   const FIELD_OF_VIEW_DEG = 32;
@@ -8,12 +8,12 @@
   const players = [];
 
   function makeRenderer() {
-    const made = new THREE.WebGLRenderer({ antialias: true, alpha: true });
-    made.outputEncoding = THREE.sRGBEncoding;
-    made.shadowMap.enabled = true;
-    made.shadowMap.type = THREE.PCFSoftShadowMap;
-    made.setClearColor(0xffffff, 0);
-    return made;
+    const webgl = new THREE.WebGLRenderer({ antialias: true, alpha: true });
+    webgl.outputEncoding = THREE.sRGBEncoding;
+    webgl.shadowMap.enabled = true;
+    webgl.shadowMap.type = THREE.PCFSoftShadowMap;
+    webgl.setClearColor(0xffffff, 0);
+    return webgl;
   }
 
   function bytesOf(element) {
@@ -50,7 +50,7 @@
       this.painted = [];
     }
 
-    // A report holds dozens of motions: the ones in view are read first, the others one after another behind them.
+    // A report has dozens of motions: visible ones are loaded first, then the others one after another.
     wait() {
       new IntersectionObserver((entries) => {
         this.visible = entries[entries.length - 1].isIntersecting;
@@ -88,7 +88,7 @@
       drawn.players = String(Number(drawn.players || 0) + 1);
     }
 
-    // What else stands on the page may follow the motion: "loaded" once, "shown" whenever another moment is shown.
+    // Events for other scripts of the page: "loaded" once, "shown" whenever the displayed time changes.
     announce(name) {
       this.figure.dispatchEvent(new CustomEvent(name, { bubbles: true, detail: this }));
     }

@@ -1,7 +1,7 @@
-"""Self-contained pages that play motions: three.js and the GLB inside the one HTML file, nothing fetched.
+"""Self-contained pages that play motions: three.js and the GLB are embedded in one HTML file.
 
-three.js and its GLTFLoader (MIT) lie in ``vendor``, where their version and licence are stated. The camera starts where
-it sees the whole motion, with hand and object beside each other.
+three.js and its GLTFLoader (MIT) are in ``vendor``, with their version and licence. The camera starts where it sees the
+whole motion, with hand and object next to each other.
 """
 
 import base64
@@ -30,8 +30,8 @@ from pipelines.pages.glb import (
 )
 from pipelines.pages.surface import ContactPaint
 
-_ROOM = Path(__file__).parent
-ASIDE_RAD = np.radians(40.0)  # looking past the touched side shows where the contact ends
+_FOLDER = Path(__file__).parent
+ASIDE_RAD = np.radians(40.0)  # a view past the touched side shows the border of the contact
 _POINTS_FOR_VIEW = 400
 _HAND_MARGIN_M = 0.015
 _NEAR_M = 0.10
@@ -39,7 +39,7 @@ _NEAR_M = 0.10
 
 @dataclass(frozen=True)
 class View:
-    """Where the camera starts, in the GLB's upright world (y up), metres and radians; ground_m None: no ground."""
+    """The initial camera in the GLB's upright world (y up); without ground if ``ground_m`` is None."""
 
     centre: tuple[float, float, float]
     radius_m: float
@@ -52,14 +52,14 @@ class View:
 
 @dataclass(frozen=True)
 class Player:
-    """One motion on a page. title: read aloud for the drawing; caption: shown above it; legend: (name, CSS colour)."""
+    """One motion on a page."""
 
     glb: bytes
-    title: str
+    title: str  # for screen readers
     view: View
-    caption: str = ""
-    legend: tuple[tuple[str, str], ...] = ()
-    contact_label: str = ""
+    caption: str = ""  # shown above the motion
+    legend: tuple[tuple[str, str], ...] = ()  # (name, CSS colour)
+    contact_label: str = ""  # meaning of the contact colours
 
     @property
     def view_values(self) -> dict:
@@ -67,7 +67,7 @@ class Player:
 
     @property
     def glb_packed(self) -> str:
-        """The GLB as the page holds it: deflated, a third of the bytes, then base64."""
+        """The GLB as embedded in the page: deflated to a third of the bytes, then base64."""
         return base64.b64encode(zlib.compress(self.glb, 9)).decode("ascii")
 
 
@@ -80,9 +80,11 @@ def motion_player(
     contact_label: str = "",
     ghosts: Mapping[Side, HandTrack] = MappingProxyType({}),
 ) -> Player:
-    """A player of ``clip``: the valid hands, the object, and ``contact`` painted on it. contact_label: its meaning.
+    """A player of ``clip``: the valid hands and the object, coloured by ``contact``.
 
-    ghosts: hands to see through, those of the recording.
+    Args:
+        contact_label: the meaning of the contact colours.
+        ghosts: transparent hands, those of the recording.
     """
     return Player(
         glb=glb_bytes(clip, hands, contact, ghosts),
@@ -97,9 +99,11 @@ def motion_player(
 def contact_player(
     clip: Clip, paint: ContactPaint, title: str, caption: str, label: str, look_at: ContactPaint | None = None
 ) -> Player:
-    """The clip's object at rest, as it lies in the first frame, with a contact map to turn and look at.
+    """A player of the object in the pose of the first frame, coloured by a contact map.
 
-    label: what the colours mean. look_at: the map whose touched side the camera sees; by default ``paint``.
+    Args:
+        label: the meaning of the colours.
+        look_at: the map whose touched side the camera sees; by default ``paint``.
     """
     absent = {side: replace(track, valid=np.zeros_like(track.valid)) for side, track in clip.hands.items()}
     still = replace(clip, hands=absent, other_objects=()).take(slice(0, 1))
@@ -108,20 +112,24 @@ def contact_player(
 
 
 def write_page(path: str | Path, template: str, **values: object) -> Path:
-    """Write the finished HTML of one template, whole or not at all; arguments as in ``render_page``."""
+    """Write the HTML of one template atomically; arguments as in ``render_page``."""
     return write_whole(path, render_page(template, **values))
 
 
 def render_page(template: str, **values: object) -> str:
-    """The finished HTML of one template of this room; autoescaped, and an unknown name is an error."""
+    """The HTML of one template of this package; values are escaped, and an undefined name is an error."""
     environment = Environment(
-        loader=FileSystemLoader(_ROOM), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=FileSystemLoader(_FOLDER),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     has_players = bool(values.get("has_players"))
     return environment.get_template(template).render(
-        css=Markup((_ROOM / "page.css").read_text(encoding="utf-8")),
+        css=Markup((_FOLDER / "page.css").read_text(encoding="utf-8")),
         three_js=Markup(three_javascript()) if has_players else "",
-        player_js=Markup((_ROOM / "player.js").read_text(encoding="utf-8")) if has_players else "",
+        player_js=Markup((_FOLDER / "player.js").read_text(encoding="utf-8")) if has_players else "",
         **values,
     )
 
@@ -129,7 +137,7 @@ def render_page(template: str, **values: object) -> str:
 @lru_cache(maxsize=1)
 def three_javascript() -> str:
     """three.js and GLTFLoader, with the MIT notice at the top."""
-    return "\n".join((_ROOM / "vendor" / name).read_text("utf-8") for name in ("three.min.js", "GLTFLoader.min.js"))
+    return "\n".join((_FOLDER / "vendor" / name).read_text("utf-8") for name in ("three.min.js", "GLTFLoader.min.js"))
 
 
 def css_colour(colour: tuple[float, float, float]) -> str:
@@ -140,26 +148,26 @@ def _legend(clip: Clip) -> tuple[tuple[str, str], ...]:
     rows = [(f"{side} hand", css_colour(HAND_COLOURS[side])) for side in SIDES if clip.hands[side].valid.any()]
     rows.append((clip.object_words, css_colour(OBJECT_COLOUR)))
     if clip.object.is_articulated:
-        rows.append(("its moving part", css_colour(MOVING_PART_COLOUR)))
+        rows.append(("moving part", css_colour(MOVING_PART_COLOUR)))
     return tuple(rows)
 
 
 def view_of(clip: Clip, hands: HandPair) -> View:
-    """A camera that sees the whole motion of the object and of the hands that come near it, from the side.
+    """A camera that sees the whole motion of the object and of nearby hands from the side.
 
-    The ground lies under the lowest point of all objects (a table too) and of all hands.
+    The ground is at the lowest point of all objects, tables included, and of all hands.
     """
     upright = upright_rotation(clip.gravity).as_matrix()
     object_points = _object_points(clip.object) @ upright.T
     others = [_object_points(track) @ upright.T for track in clip.other_objects]
-    seen = [(track, hands[side]) for side, track in clip.hands.items() if track.valid.any()]
-    everyone = [(track.valid, track_joints(track, model) @ upright.T) for track, model in seen]
-    hand_points = [joints[valid] for valid, joints in everyone if _comes_near(joints, valid, object_points)]
+    tracks = [(track, hands[side]) for side, track in clip.hands.items() if track.valid.any()]
+    valid_joints = [(track.valid, track_joints(track, model) @ upright.T) for track, model in tracks]
+    hand_points = [joints[valid] for valid, joints in valid_joints if _comes_near(joints, valid, object_points)]
     shown = np.concatenate([object_points.reshape(-1, 3), *(points.reshape(-1, 3) for points in hand_points)])
     centre = (shown.min(axis=0) + shown.max(axis=0)) / 2
     radius = float(np.linalg.norm(shown - centre, axis=1).max()) + _HAND_MARGIN_M
-    things = [points[..., 1].min() for points in (object_points, *others)]
-    lowest = min(*things, *(joints[valid, :, 1].min() for valid, joints in everyone), np.inf)
+    lowest_m = [points[..., 1].min() for points in (object_points, *others)]
+    lowest = min(*lowest_m, *(joints[valid, :, 1].min() for valid, joints in valid_joints), np.inf)
     return View(
         centre=_rounded(centre),
         radius_m=round(radius, 4),
@@ -185,22 +193,22 @@ def _still_view(clip: Clip, look_from: np.ndarray) -> View:
 
 
 def _touched_side(clip: Clip, paint: ContactPaint) -> np.ndarray:
-    """(3,) unit direction, in the upright world of the first frame, from the object's middle to where it is touched."""
-    turn = upright_rotation(clip.gravity).as_matrix() @ rotvec_to_rotmat(clip.object.rotvec[:1])[0]
+    """(3,) unit direction from the object's centre to its touched side, in the upright world of the first frame."""
+    rotation = upright_rotation(clip.gravity).as_matrix() @ rotvec_to_rotmat(clip.object.rotvec[:1])[0]
     toward = (paint.points_m - paint.points_m.mean(axis=0)).T @ paint.value
-    direction = turn @ toward + np.array((1e-6, 0.0, 1e-6))
+    direction = rotation @ toward + np.array((1e-6, 0.0, 1e-6))
     return direction / np.linalg.norm(direction)
 
 
 def _object_points(track: ObjectTrack) -> np.ndarray:
-    """(frame, point, 3) world points of an object, thinned evenly."""
+    """(frame, point, 3) world points of an object, a regular subset of the vertices."""
     model = track.model
     step = max(1, len(model.vertices_m) // _POINTS_FOR_VIEW)
     return track.points_in_world(model.vertices_m[::step], model.part[::step])
 
 
 def _comes_near(joints: np.ndarray, valid: np.ndarray, object_points: np.ndarray) -> bool:
-    """Whether a joint ever comes within 10 cm of the ball around the object: an idle hand must not widen the view."""
+    """Whether a joint comes within 10 cm of the object's bounding ball: an idle hand must not widen the view."""
     moving = np.broadcast_to(object_points, (len(joints), *object_points.shape[1:]))
     centre = moving.mean(axis=1, keepdims=True)
     reach = np.linalg.norm(moving - centre, axis=2).max(axis=1, keepdims=True)
@@ -208,7 +216,7 @@ def _comes_near(joints: np.ndarray, valid: np.ndarray, object_points: np.ndarray
 
 
 def _side_azimuth(object_points: np.ndarray, hand_points: list[np.ndarray]) -> float:
-    """Azimuth across the line from the hands to the object, so that neither hides the other; pi/5 without hands."""
+    """Azimuth across the line from hands to object, so that neither occludes the other; pi/5 without hands."""
     if not hand_points:
         return float(np.pi / 5)
     wrists = np.concatenate([points[:, 0] for points in hand_points]).mean(axis=0)

@@ -1,4 +1,4 @@
-"""Quality control of one dataset as the report shows it: a table, a chart of every measure, and what was left out."""
+"""Quality control of one dataset on the report: tables, a histogram of every measure, and excluded clips."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -20,49 +20,44 @@ from pipelines.pages.metrics_table import number
 COLUMNS = 5
 BINS = 24
 WARN_COLOUR, LEAVE_OUT_COLOUR = "#c98a00", "#b5371f"
-# A limit farther away than this times what the clips show would leave the chart empty.
+# A limit beyond this multiple of the largest value is not drawn: it would leave the chart empty.
 FARTHEST = 2.5
-
-
-# What the stage counts, by the entry of its info.json.
+# Entries of ``counts`` in the stage's info.json.
 COUNTS = ("clips", "ok", "warned", "left_out", "objects", "objects_warned", "objects_left_out")
 
 
 @dataclass(frozen=True)
 class MeasureRow:
-    """One measure over a dataset. worst_id: where it is; warn, leave_out: the limits as text, "" for none."""
+    """One measure over the clips or meshes of a dataset."""
 
     words: str
     unit: str
     median: str
     worst: str
-    worst_id: str
-    warn: str
-    leave_out: str
+    worst_id: str  # the clip or object with the worst value
+    warn: str  # limit of warnings, "" for none
+    leave_out: str  # limit of exclusion, "" for none
     warned: int
     left_out: int
 
 
 @dataclass(frozen=True)
 class QualityFacts:
-    """What quality control found. failed, warned, notes: (clip, why); meshes: objects that are not ok, with why.
-
-    unmeasured: (measure, why, clips) of the measures that some clips do not have.
-    """
+    """The results of quality control for one dataset."""
 
     summary: str
     clips: list[MeasureRow]
     meshes: list[MeasureRow]
     chart: Markup
-    failed: list[tuple[str, str]] = field(default_factory=list)
-    warned: list[tuple[str, str]] = field(default_factory=list)
-    unsound: list[tuple[str, str, str]] = field(default_factory=list)
-    notes: list[tuple[str, int]] = field(default_factory=list)
-    unmeasured: list[tuple[str, str, int]] = field(default_factory=list)
+    failed: list[tuple[str, str]] = field(default_factory=list)  # (clip, reason)
+    warned: list[tuple[str, str]] = field(default_factory=list)  # (clip, reason)
+    unsound: list[tuple[str, str, str]] = field(default_factory=list)  # (object, verdict, reason)
+    notes: list[tuple[str, int]] = field(default_factory=list)  # (note, clips)
+    unmeasured: list[tuple[str, str, int]] = field(default_factory=list)  # (measure, reason, clips)
 
 
 def read_quality(folder: Path, dataset: str) -> QualityFacts | None:
-    """What the stage left in ``folder``; None where it has not run, or found no clip."""
+    """The results in the stage's ``folder``; None if it has not run or there are no clips."""
     if not (folder / "clips.parquet").is_file():
         return None
     info = read_json(folder / "info.json", {"counts": dict.fromkeys(COUNTS, int)})
@@ -77,7 +72,7 @@ def read_quality(folder: Path, dataset: str) -> QualityFacts | None:
         chart=Markup(measures_svg(clips, CLIP_MEASURES, limits, f"{dataset} quality")),
         failed=[(name, why) for name, verdict, why in _judged(clips, "clip_id") if verdict == "left out"],
         warned=[(name, why) for name, verdict, why in _judged(clips, "clip_id") if verdict == "warned"],
-        unsound=[row for row in _judged(meshes, "object") if row[1] != "ok"],
+        unsound=[record for record in _judged(meshes, "object") if record[1] != "ok"],
         notes=sorted(Counter(note for note in clips["note"].tolist() if note).items()),
         unmeasured=[
             (measure.words, measure.unmeasured, missing)
@@ -88,7 +83,7 @@ def read_quality(folder: Path, dataset: str) -> QualityFacts | None:
 
 
 def read_limits(folder: Path) -> dict[str, dict[str, float | None]]:
-    """The limits ``warn`` and ``leave_out`` of every measure, as the stage used them. Raises BadInput."""
+    """The limits ``warn`` and ``leave_out`` of every measure that the stage used. Raises BadInput."""
     limit = {"warn": NUMBER_OR_NONE, "leave_out": NUMBER_OR_NONE}
     names = [measure.name for measure in (*CLIP_MEASURES, *MESH_MEASURES)]
     info = read_json(folder / "info.json", {"thresholds": {"limits": dict.fromkeys(names, limit)}})
@@ -98,7 +93,7 @@ def read_limits(folder: Path) -> dict[str, dict[str, float | None]]:
 def measures_svg(
     table: pd.DataFrame, measures: Sequence[Measure], limits: Mapping[str, dict[str, float | None]], salt: str
 ) -> str:
-    """A histogram of each measure over the clips, with its limits as lines, but for those that were never taken."""
+    """A histogram over the clips with limits as lines, for every measure with a value."""
     sizes = {measure.name: np.abs(_values(table, measure)) for measure in measures}
     shown = [measure for measure in measures if np.isfinite(sizes[measure.name]).any()]
     rows = -(-len(shown) // COLUMNS)
@@ -116,8 +111,8 @@ def measures_svg(
 
 def _draw_measure(axes: Axes, measure: Measure, values: np.ndarray, limit: dict[str, float | None]) -> None:
     warn, leave_out = limit["warn"], limit["leave_out"]
-    seen = max(float(values.max()), warn or 0.0) or 1.0
-    right = seen if leave_out is None or leave_out > FARTHEST * seen else max(seen, leave_out)
+    highest = max(float(values.max()), warn or 0.0) or 1.0
+    right = highest if leave_out is None or leave_out > FARTHEST * highest else max(highest, leave_out)
     axes.hist(values, bins=np.linspace(0, right * 1.04, BINS + 1).tolist(), color=COLOURS[0])
     axes.set_xlim(0, right * 1.04)
     for limit_value, colour in ((warn, WARN_COLOUR), (leave_out, LEAVE_OUT_COLOUR)):
@@ -144,7 +139,7 @@ def _row(table: pd.DataFrame, key: str, measure: Measure, limit: dict[str, float
         unit=measure.unit,
         median=_text(float(np.median(sizes))) if len(sizes) else "not measured",
         worst=_text(values[np.nanargmax(np.abs(values))]) if len(sizes) else "",
-        # Where all are alike, none is the worst.
+        # Equal values have no worst one.
         worst_id=str(table[key].tolist()[np.nanargmax(np.abs(values))]) if len(set(sizes)) > 1 else "",
         warn="" if warn is None else f"{warn:g}",
         leave_out="" if leave_out is None else f"{leave_out:g}",
@@ -154,7 +149,7 @@ def _row(table: pd.DataFrame, key: str, measure: Measure, limit: dict[str, float
 
 
 def _values(table: pd.DataFrame, measure: Measure) -> np.ndarray:
-    """(row,) the measure; NaN where it was not taken."""
+    """(row,) values of a measure; NaN if not measured."""
     return np.array(table[measure.name].tolist(), dtype=np.float64)
 
 
@@ -165,12 +160,13 @@ def _text(value: float) -> str:
 
 def _summary(counts: Mapping[str, int]) -> str:
     return (
-        f"Of {counts['clips']:,} clips {counts['ok']:,} are sound, {counts['warned']:,} are warned of and kept, "
-        f"{counts['left_out']:,} are left out of annotation, training and evaluation. Of {counts['objects']:,} meshes "
-        f"{counts['objects_warned']:,} are warned of and {counts['objects_left_out']:,} left out with their clips."
+        f"Of {counts['clips']:,} clips {counts['ok']:,} pass, {counts['warned']:,} have warnings and "
+        f"{counts['left_out']:,} are excluded from annotation, training and evaluation. Of {counts['objects']:,} "
+        f"meshes {counts['objects_warned']:,} have warnings and {counts['objects_left_out']:,} are excluded with their "
+        "clips."
     )
 
 
 def _judged(table: pd.DataFrame, key: str) -> list[tuple[str, str, str]]:
-    """(name, verdict, reasons) of each row."""
+    """(name, verdict, reasons) of each clip or mesh."""
     return list(zip(*(table[column].tolist() for column in (key, "verdict", "reasons")), strict=True))

@@ -1,4 +1,4 @@
-"""The report of one profile: a self-contained page over all its datasets, and beside it a page per dataset."""
+"""The report of one profile: a self-contained page for all datasets, and one page per dataset next to it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ from pipelines.pages.curves import Panel, log_curves, panels_svg, read_log
 from pipelines.pages.dataset_facts import DatasetFacts, read_dataset, reason_for_nothing
 from pipelines.pages.dataset_page import can_be_shown, write_dataset_page
 from pipelines.pages.examples import first_motion, motion_contact, shown_ids, shown_subset, true_contact
-from pipelines.pages.metrics_table import CONTROLS, LOOKUPS, MetricsTable, metrics_tables
+from pipelines.pages.metrics_table import CONTROLS, RETRIEVAL_BASELINES, MetricsTable, metrics_tables
 from pipelines.pages.player import Player, contact_player, motion_player, render_page
 from pipelines.pages.quality import QualityFacts, read_quality
 from pipelines.pages.surface import ContactPaint
@@ -26,7 +26,7 @@ CONTACT_EXAMPLES = 3
 
 @dataclass(frozen=True)
 class ReportFolders:
-    """Where the stages of one profile wrote: each folder holds one entry per dataset."""
+    """The output folders of the stages of one profile, each with one entry per dataset."""
 
     data: Path
     checkpoints: Path
@@ -40,28 +40,25 @@ class ReportFolders:
 
 @dataclass(frozen=True)
 class Section:
-    """One dataset on the page. motions: recorded and generated, side by side; contact: sentence, (truth, predicted).
-
-    page: the dataset's own page, beside the report's; "" where a stage it needs has not run.
-    """
+    """One dataset on the page."""
 
     facts: DatasetFacts
     title: str
-    page: str = ""
-    shown: str = ""
+    page: str = ""  # file name of the dataset's page; "" if a stage it needs has not run
+    shown: str = ""  # which subset the examples are from, in words
     quality: QualityFacts | None = None
-    motions: list[Player] = field(default_factory=list)
+    motions: list[Player] = field(default_factory=list)  # recorded, generated and retrieved
     motion_facts: list[tuple[str, str]] = field(default_factory=list)
-    contact: list[tuple[str, list[Player]]] = field(default_factory=list)
+    contact: list[tuple[str, list[Player]]] = field(default_factory=list)  # (sentence, [recorded, generated])
     table: MetricsTable | None = None
     curves: list[dict[str, str]] = field(default_factory=list)
-    missing: list[tuple[str, str]] = field(default_factory=list)
+    missing: list[tuple[str, str]] = field(default_factory=list)  # (network, why it was not trained)
 
 
-# Text encoders that are not CLIP, which Text2HOI has.
+# Text encoders other than CLIP, which Text2HOI uses.
 ENCODERS = {
-    "use": "the Universal Sentence Encoder (offline), in the place of Text2HOI's CLIP",
-    "hash": "hashed words, which know no meaning, in the place of Text2HOI's CLIP",
+    "use": "the Universal Sentence Encoder (offline), in place of Text2HOI's CLIP",
+    "hash": "hashed words, which carry no meaning, in place of Text2HOI's CLIP",
 }
 
 
@@ -72,15 +69,16 @@ def write_report(
     hands: HandPair,
     folders: ReportFolders | None = None,
 ) -> Path:
-    """Write ``out/index.html`` from what the stages of ``profile`` left in ``folders`` (below the current folder).
+    """Write ``out/index.html``, the pages of datasets ``out/<dataset>.html`` and of their examples in ``out/clips``.
 
-    Beside it the page of each dataset, ``out/<dataset>.html``, and in ``out/clips`` those of its examples.
-
-    families: by dataset; metrics are shown in this order, and motions of the first one next to the recorded ones.
     Equal inputs give equal bytes. Datasets without clips are listed with their reason.
+
+    Args:
+        families: by dataset, in the order of the table. Motions of the first one are shown next to recorded ones.
+        folders: outputs of the stages; by default those below the current folder.
     """
     folders = folders or ReportFolders.of(profile)
-    all_sections = [_section(name, folders, own, hands) for name, own in families.items()]
+    all_sections = [_section(name, folders, names, hands) for name, names in families.items()]
     sections = [section for section in all_sections if not section.facts.empty or section.facts.quarantine]
     synthetic = any(section.facts.synthetic for section in sections)
     has_players = any(section.motions or section.contact for section in sections)
@@ -99,11 +97,11 @@ def write_report(
 
 
 def _stand_ins(sections: Sequence[Section]) -> list[str]:
-    """What stands in the place of what a dataset or a method was made with, in sentences."""
+    """The replacements of licensed models or encoders that the profile uses, in words."""
     infos = [section.facts.info for section in sections if section.facts.info]
     notes = [note for info in infos if (note := stand_in_note(info))]
-    every = [section.facts.annotated.annotation_info for section in sections if section.facts.annotated]
-    names = {str(info["encoder"]["name"]) for info in every}
+    annotation_infos = [section.facts.annotated.annotation_info for section in sections if section.facts.annotated]
+    names = {str(info["encoder"]["name"]) for info in annotation_infos}
     notes += [f"sentences are encoded by {ENCODERS[name]}" for name in sorted(names & ENCODERS.keys())]
     return notes
 
@@ -115,12 +113,12 @@ def _section(name: str, folders: ReportFolders, families: Sequence[str], hands: 
         return Section(facts, title)
     networks = sorted(path for path in (folders.checkpoints / name).glob("*") if path.is_dir())
     samples = folders.samples / name / families[0]
-    motions, motion_facts = _motions(facts, hands, _rivals(folders.samples / name, families[0]))
+    motions, motion_facts = _motions(facts, hands, _sample_folders(folders.samples / name, families[0]))
     return Section(
         facts,
         title,
         page=f"{name}.html" if can_be_shown(folders.data / name) else "",
-        shown=_what_is_shown(facts),
+        shown=_shown_words(facts),
         quality=read_quality(folders.data / name / "quality", name),
         motions=motions,
         motion_facts=motion_facts,
@@ -131,35 +129,42 @@ def _section(name: str, folders: ReportFolders, families: Sequence[str], hands: 
     )
 
 
-def _what_is_shown(facts: DatasetFacts) -> str:
+def _shown_words(facts: DatasetFacts) -> str:
     subset = "" if facts.annotated is None else shown_subset(facts.annotated)
-    names = {"test": "A clip of the test split", "validation": "A validation clip (no clips test)"}
-    return names.get(subset, "A training clip (no clips test or validate)")
+    names = {"test": "A test clip", "validation": "A validation clip (the split has no test clips)"}
+    return names.get(subset, "A training clip (the split has no test or validation clips)")
 
 
-def _rivals(samples: Path, family: str) -> dict[str, Path]:
-    """Whose motions stand beside the recorded clip: the family's, and those of the best lookup that was sampled."""
-    lookups = [path for name in LOOKUPS[::-1] for path in (samples / CONTROLS / name, samples / name) if path.is_dir()]
-    return {f"Generated by {family}": samples / family} | {f"Looked up ({path.name})": path for path in lookups[:1]}
+def _sample_folders(samples: Path, family: str) -> dict[str, Path]:
+    """The sample folders to show next to the recorded clip: of the family, and of the best retrieval baseline."""
+    retrieval_folders = [
+        path
+        for name in RETRIEVAL_BASELINES[::-1]
+        for path in (samples / CONTROLS / name, samples / name)
+        if path.is_dir()
+    ]
+    return {f"Generated by {family}": samples / family} | {
+        f"Retrieved ({path.name})": path for path in retrieval_folders[:1]
+    }
 
 
 def _motions(
-    facts: DatasetFacts, hands: HandPair, rivals: dict[str, Path]
+    facts: DatasetFacts, hands: HandPair, sample_folders: dict[str, Path]
 ) -> tuple[list[Player], list[tuple[str, str]]]:
-    """A recorded clip, and beside it the motions that rivals made for its sentence and object."""
+    """Players of a recorded clip and of the sampled motions for its sentence and object, with their ids."""
     annotated = facts.annotated
     if annotated is None or not (ids := shown_ids(annotated, 1)):
         return [], []
-    recorded = f"{'Synthetic ground truth' if facts.synthetic else 'Recorded'}"
+    recorded = "Synthetic ground truth" if facts.synthetic else "Recorded"
     players = [_player(annotated, ids[0], annotated.clip(ids[0]), hands, recorded, true_contact(annotated, ids[0]))]
-    told = [("clip", ids[0])]
-    for kind, samples in rivals.items():
+    shown = [("clip", ids[0])]
+    for kind, samples in sample_folders.items():
         motion = first_motion(samples, ids[0], hands)
         if motion is not None:
             paint = motion_contact(annotated, ids[0], motion, hands)
             players.append(_player(annotated, ids[0], motion, hands, kind, paint))
-            told.append((kind, motion.clip_id))
-    return players, told
+            shown.append((kind, motion.clip_id))
+    return players, shown
 
 
 def _player(
@@ -170,12 +175,12 @@ def _player(
 
 
 def touch_words(annotated: AnnotatedStore) -> str:
-    """What a contact map shows, with the threshold it was made with."""
+    """The legend of a contact map, with the contact threshold."""
     return f"within {annotated.contact_threshold_m * 100:g} cm of a joint"
 
 
 def _contact_pairs(facts: DatasetFacts, hands: HandPair, samples: Path) -> list[tuple[str, list[Player]]]:
-    """For some test clips the points that are touched in the clip, and those a family's motion touches."""
+    """Per example clip, the sentence and the recorded and generated contact maps."""
     annotated = facts.annotated
     if annotated is None:
         return []
@@ -195,7 +200,7 @@ def _contact_pairs(facts: DatasetFacts, hands: HandPair, samples: Path) -> list[
 
 
 def _loss_chart(dataset: str, model: str, log: Path) -> dict[str, str] | None:
-    """The losses of a training log: what was minimised and its parts, and the validation loss in a panel of its own."""
+    """The losses of a training log: one panel for the training loss and its terms, one for the validation loss."""
     curves = log_curves(read_log(log)) if log.is_file() else []
     if not curves:
         return None

@@ -1,4 +1,4 @@
-"""An object's mesh made ready for the eye: crisp edges, and a contact map painted on a surface fine enough for it."""
+"""Prepares an object's mesh for display: crease normals, and subdivision fine enough to show a contact map."""
 
 from dataclasses import dataclass
 
@@ -17,28 +17,27 @@ PAINT_NEIGHBOURS = 12
 
 @dataclass(frozen=True)
 class ContactPaint:
-    """A contact map to paint. points_m: (point, 3) object frame, metres; part: (point,) 0 base, 1 moving part;
-    value: (point,) in [0, 1], 1 = touched."""
+    """A contact map to paint on an object."""
 
-    points_m: np.ndarray
-    part: np.ndarray
-    value: np.ndarray
+    points_m: np.ndarray  # (point, 3) object frame
+    part: np.ndarray  # (point,) 0 base, 1 moving part
+    value: np.ndarray  # (point,) in [0, 1], 1 = touched
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Triangles to draw. vertices_m, normals: (vertex, 3) object frame; faces: (face, 3); value: (vertex,) or None."""
+    """Triangles to draw, in the object frame."""
 
-    vertices_m: np.ndarray
-    normals: np.ndarray
-    faces: np.ndarray
-    value: np.ndarray | None = None
+    vertices_m: np.ndarray  # (vertex, 3)
+    normals: np.ndarray  # (vertex, 3)
+    faces: np.ndarray  # (face, 3)
+    value: np.ndarray | None = None  # (vertex,) of a contact map
 
 
 def display_surface(vertices_m: np.ndarray, faces: np.ndarray, paint: ContactPaint | None = None) -> Surface:
-    """Shaded triangles of one rigid part; with ``paint``, cut finely enough that the map shows (about 6 mm).
+    """Triangles of one rigid part with normals; with ``paint``, subdivided to edges of about 6 mm and coloured.
 
-    paint must hold the points of this part only; without any point the value is zero everywhere.
+    ``paint`` must have the points of this part only; without points the value is zero everywhere.
     """
     corner_normals = crease_normals(vertices_m, faces)
     if paint is None:
@@ -50,7 +49,7 @@ def display_surface(vertices_m: np.ndarray, faces: np.ndarray, paint: ContactPai
 
 
 def crease_normals(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals (face, 3, 3) per face corner: area-weighted over the faces that meet there within 40 degrees."""
+    """Unit normals (face, 3, 3) per face corner: area-weighted mean over adjacent faces within 40 degrees."""
     triangles = vertices_m[faces].astype(np.float64)
     doubled = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     unit = doubled / np.maximum(np.linalg.norm(doubled, axis=1, keepdims=True), 1e-20)
@@ -68,7 +67,7 @@ def crease_normals(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def paint_values(vertices_m: np.ndarray, paint: ContactPaint) -> np.ndarray:
-    """The map at each vertex: mean of its nearest sample points, weighted by a Gaussian as wide as their spacing."""
+    """(vertex,) map values: mean of the closest sample points under a Gaussian as wide as the point spacing."""
     count = min(PAINT_NEIGHBOURS, len(paint.points_m))
     if count < 2:
         return np.full(len(vertices_m), paint.value.sum())
@@ -82,7 +81,7 @@ def paint_values(vertices_m: np.ndarray, paint: ContactPaint) -> np.ndarray:
 
 
 def _subdivide(corners: np.ndarray, normals: np.ndarray, edge_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Cut (face, 3, 3) triangles until no edge is longer than ``edge_m``; normals follow by barycentric weights."""
+    """Subdivide (face, 3, 3) triangles to edges of at most ``edge_m``; normals are interpolated barycentrically."""
     soup = corners.reshape(-1, 3)
     cut_vertices, cut_faces, origin = trimesh.remesh.subdivide_to_size(  # pyright: ignore[reportAssignmentType]
         soup, np.arange(len(soup)).reshape(-1, 3), edge_m, max_iter=12, return_index=True
@@ -98,7 +97,7 @@ def _subdivide(corners: np.ndarray, normals: np.ndarray, edge_m: float) -> tuple
 
 
 def _merge(corners: np.ndarray, normals: np.ndarray) -> Surface:
-    """Corners of equal position (1 um) and normal become one vertex."""
+    """Merge corners of equal position (to 1 um) and normal to one vertex."""
     rows = np.concatenate([np.round(corners.reshape(-1, 3), 6), np.round(normals.reshape(-1, 3), 4)], axis=1)
     first, number = distinct_rows(rows)
     return Surface(corners.reshape(-1, 3)[first], rows[first, 3:], number.reshape(-1, 3))

@@ -25,7 +25,7 @@ CODE = Path("code/evaluate.json")
 class EvaluateSettings:
     """The section ``evaluate`` of params.yaml."""
 
-    metrics: tuple[str, ...] = ()  # lists of ``hoidata/metrics/asked_metrics.py`` to compute in addition to the default
+    metrics: tuple[str, ...] = ()  # lists of ``hoidata/metrics/optional_metrics.py`` to compute as well
 
 
 def run(paths: StagePaths) -> None:
@@ -74,8 +74,8 @@ def _cached_or_measured(paths: StagePaths, settings: EvaluateSettings, shared: l
 def _measured(paths: StagePaths, settings: EvaluateSettings) -> dict[str, Any]:
     if reason := next(filter(None, map(empty_reason, (*_inputs(paths), paths.samples))), None):
         return {"empty": reason, "held_out_clips": 0}
-    from hoidata.metrics.asked_metrics import with_lists
     from hoidata.metrics.evaluate import evaluate_store
+    from hoidata.metrics.optional_metrics import with_lists
 
     print(f"{paths}: measuring", flush=True)
     metrics = evaluate_store(

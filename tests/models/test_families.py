@@ -1,4 +1,4 @@
-"""Families answer requests with clips: every rival gives what its name says, whatever company a request is in."""
+"""Families answer requests with clips; an answer does not depend on the other requests of the batch."""
 
 import json
 from dataclasses import replace
@@ -16,11 +16,11 @@ from hoidata.clips.clip import SIDES, Clip
 from hoidata.contact.maps import f1_score
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
-from hoidata.metrics.asked import read_asked
+from hoidata.metrics.target_contact import read_asked
 from hoidata.refinement import HoldSettings, hold_hands
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
-from models.baselines.lookups import Lookup
+from models.baselines.retrieval import Retrieval
 from models.common.family import Sources, motion_clip
 from models.common.predicting import PredictionConfig, ReportsContact, requests_for, sample_family, spread
 from models.registry import family_names, load_family, load_network
@@ -47,7 +47,7 @@ def answer(sources: Sources, family: str, sample: ClipSample, count: int = 1) ->
     return load_family(family).load(sources).sample(requests_for(sample, PredictionConfig(samples=count)))
 
 
-def test_every_family_of_the_registry_knows_its_own_name_and_no_two_share_a_network() -> None:
+def test_registered_families_have_their_name_and_share_no_network() -> None:
     families = [load_family(name) for name in family_names()]
     assert [family.name for family in families] == family_names()
     networks = [network.name for family in families for network in family.networks]
@@ -57,40 +57,40 @@ def test_every_family_of_the_registry_knows_its_own_name_and_no_two_share_a_netw
         load_family("juggler")
 
 
-def test_features_of_a_recorded_clip_give_it_back(annotated: AnnotatedStore) -> None:
+def test_features_of_a_recorded_clip_decode_to_it(annotated: AnnotatedStore) -> None:
     for sample in samples_of(annotated, "train"):
         recorded = annotated.clip(sample.clip_id)
         request = requests_for(sample, PredictionConfig())[0]
-        made = motion_clip(request, torch.from_numpy(sample.hands), torch.from_numpy(sample.object), True)
-        np.testing.assert_allclose(made.object.translation_m, recorded.object.translation_m, atol=1e-5)
-        np.testing.assert_allclose(made.object.rotvec, recorded.object.rotvec, atol=1e-4)
+        decoded = motion_clip(request, torch.from_numpy(sample.hands), torch.from_numpy(sample.object), True)
+        np.testing.assert_allclose(decoded.object.translation_m, recorded.object.translation_m, atol=1e-5)
+        np.testing.assert_allclose(decoded.object.rotvec, recorded.object.rotvec, atol=1e-4)
         if recorded.object.is_articulated:
-            np.testing.assert_allclose(made.object.hinge_rad, recorded.object.hinge_rad, atol=1e-6)
-        for row, side in enumerate(SIDES):
-            assert made.hands[side].valid.all() == bool(sample.active_hands[row])
-            if sample.active_hands[row]:
+            np.testing.assert_allclose(decoded.object.hinge_rad, recorded.object.hinge_rad, atol=1e-6)
+        for index, side in enumerate(SIDES):
+            assert decoded.hands[side].valid.all() == bool(sample.active_hands[index])
+            if sample.active_hands[index]:
                 expected = track_joints(recorded.hands[side], HANDS[side])
-                np.testing.assert_allclose(track_joints(made.hands[side], HANDS[side]), expected, atol=2e-5)
+                np.testing.assert_allclose(track_joints(decoded.hands[side], HANDS[side]), expected, atol=2e-5)
 
 
 def test_a_motion_for_a_clip_of_unknown_gravity_claims_none(annotated: AnnotatedStore) -> None:
     """Else a hold would ask what falls along an axis that means nothing."""
     sample = samples_of(annotated, "train")[0]
     request = requests_for(replace(sample, gravity_known=False), PredictionConfig())[0]
-    made = motion_clip(request, torch.from_numpy(sample.hands), torch.from_numpy(sample.object), True)
+    motion = motion_clip(request, torch.from_numpy(sample.hands), torch.from_numpy(sample.object), True)
     assert sample.gravity_known
-    assert made.gravity is None
-    assert "not known" in made.gravity_note
+    assert motion.gravity is None
+    assert "not known" in motion.gravity_note
     clip = annotated.clip(sample.clip_id)
     store = SimpleNamespace(**{name: getattr(annotated, name) for name in dir(annotated) if not name.startswith("__")})
     store.clip = lambda clip_id: replace(clip, gravity=None, gravity_note="the source does not say")
     assert not load_sample(store, sample.clip_id).gravity_known
 
 
-@pytest.mark.parametrize(("wanted", "found"), [(0, 12), (5, 5), (7, 7), (12, 12), (40, 12)])
-def test_as_many_test_clips_as_are_asked_for_spread_evenly(wanted: int, found: int) -> None:
-    chosen = spread(list(range(12)), wanted)
-    assert len(chosen) == found
+@pytest.mark.parametrize(("requested", "expected"), [(0, 12), (5, 5), (7, 7), (12, 12), (40, 12)])
+def test_the_requested_number_of_test_clips_is_spread_evenly(requested: int, expected: int) -> None:
+    chosen = spread(list(range(12)), requested)
+    assert len(chosen) == expected
     assert chosen == sorted(set(chosen))
     assert max(np.diff(chosen)) - min(np.diff(chosen)) <= 1
 
@@ -103,28 +103,28 @@ def test_a_sampling_of_nothing_is_refused(settings: dict, named: str) -> None:
 
 def test_ground_truth_is_the_recorded_clip(sources: Sources) -> None:
     for sample in samples_of(sources.annotated, "test"):
-        (made,) = answer(sources, "ground-truth", sample)
+        (motion,) = answer(sources, "ground-truth", sample)
         recorded = sources.annotated.clip(sample.clip_id)
-        np.testing.assert_array_equal(made.object.translation_m, recorded.object.translation_m)
-        np.testing.assert_array_equal(made.hands["left"].wrist_m, recorded.hands["left"].wrist_m)
-        assert made.clip_id == f"{sample.clip_id}~0"
+        np.testing.assert_array_equal(motion.object.translation_m, recorded.object.translation_m)
+        np.testing.assert_array_equal(motion.hands["left"].wrist_m, recorded.hands["left"].wrist_m)
+        assert motion.clip_id == f"{sample.clip_id}~0"
 
 
 def test_the_mean_pose_stands_still_at_the_mean_of_the_training_wrists(sources: Sources) -> None:
     train, sample = samples_of(sources.annotated, "train"), samples_of(sources.annotated, "test")[1]
-    (made,) = answer(sources, "mean-pose", sample)
-    assert np.ptp(made.object.translation_m, axis=0).max() == 0
+    (motion,) = answer(sources, "mean-pose", sample)
+    assert np.ptp(motion.object.translation_m, axis=0).max() == 0
     wrists = np.concatenate([clip.hands[1, :, :3] for clip in train if clip.active_hands[1]])
     moved = wrists.astype(np.float64).mean(axis=0) @ sample.world_from_model[:3, :3].T + sample.world_from_model[:3, 3]
     assert sample.active_hands.tolist() == [False, True]
-    np.testing.assert_allclose(made.hands["right"].wrist_m[0], moved, atol=1e-6)
+    np.testing.assert_allclose(motion.hands["right"].wrist_m[0], moved, atol=1e-6)
 
 
 def test_the_mean_motion_moves_as_the_training_clips_do(sources: Sources) -> None:
     train, sample = samples_of(sources.annotated, "train"), samples_of(sources.annotated, "test")[0]
-    (made,) = answer(sources, "mean-motion", sample)
+    (motion,) = answer(sources, "mean-motion", sample)
     rotation = sample.world_from_model[:3, :3]
-    gone = (made.object.translation_m[-1] - made.object.translation_m[0]) @ rotation
+    gone = (motion.object.translation_m[-1] - motion.object.translation_m[0]) @ rotation
     true = np.mean([clip.object[-1, :3] - clip.object[0, :3] for clip in train], axis=0)
     np.testing.assert_allclose(gone, true, atol=0.02)
     assert np.linalg.norm(true) > 0.05
@@ -139,48 +139,52 @@ def test_the_nearest_clip_to_a_training_sentence_is_that_clip_and_the_next_is_an
 
 
 @pytest.mark.parametrize("name", ["nearest-clip", "prompt-lookup", "random-clip"])
-def test_no_lookup_copies_a_clip_in_which_an_acting_hand_is_not_always_tracked(name, sources: Sources, monkeypatch):
+def test_retrieval_skips_clips_with_an_untracked_acting_hand(name, sources: Sources, monkeypatch):
     whole = samples_of(sources.annotated, "train")
     right, both = (next(one for one in whole if one.hand_type == kind) for kind in ("right", "both"))
     gap = np.arange(both.length) != 3
     idle = replace(right, valid=right.valid & np.array([[False], [True]]))  # the hand that takes no part
-    monkeypatch.setattr("models.baselines.lookups.train_clips", lambda _: [replace(both, valid=both.valid & gap), idle])
+    monkeypatch.setattr(
+        "models.baselines.retrieval.train_clips", lambda _: [replace(both, valid=both.valid & gap), idle]
+    )
     lookup = load_family(name).load(sources)
-    assert isinstance(lookup, Lookup)
+    assert isinstance(lookup, Retrieval)
     assert [sample.clip_id for sample in lookup.train] == [right.clip_id]
 
 
-def test_another_prompt_is_never_the_own_one(sources: Sources) -> None:
+def test_another_prompt_always_differs(sources: Sources) -> None:
     test = {sample.clip_id: sample for sample in samples_of(sources.annotated, "test")}
     for clip_id, other in other_prompts(sources).items():
         assert other.clip_id in set(test) - {clip_id}
         assert not np.allclose(other.text[0], test[clip_id].text[0])
 
 
-def test_another_prompt_is_what_text2hoi_is_told(sources: Sources) -> None:
+def test_the_control_conditions_text2hoi_on_another_prompt(sources: Sources) -> None:
     request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
     other, family = other_prompts(sources)[request.clip_id], load_family("other-prompt").load(sources)
     assert isinstance(family, OtherPrompt)
-    told = replace(request, sentence=Sentence(other.sentences[0], other.verb, other.object_words), text=other.text[0])
-    assert [own.sentence for own in family.with_other_sentences([request])] == [told.sentence]
-    np.testing.assert_array_equal(family.with_other_sentences([request])[0].text, told.text)
-    (made,) = family.sample([request])
-    own, expected = load_family("text2hoi").load(sources).sample([request, told])
-    np.testing.assert_allclose(joints_of(made), joints_of(expected), atol=1e-5)
-    assert abs(joints_of(made) - joints_of(own)).max() > 1e-4
+    with_other_prompt = replace(
+        request, sentence=Sentence(other.sentences[0], other.verb, other.object_words), text=other.text[0]
+    )
+    assert [plain.sentence for plain in family.with_other_sentences([request])] == [with_other_prompt.sentence]
+    np.testing.assert_array_equal(family.with_other_sentences([request])[0].text, with_other_prompt.text)
+    (answer_of_control,) = family.sample([request])
+    plain, expected = load_family("text2hoi").load(sources).sample([request, with_other_prompt])
+    np.testing.assert_allclose(joints_of(answer_of_control), joints_of(expected), atol=1e-5)
+    assert abs(joints_of(answer_of_control) - joints_of(plain)).max() > 1e-4
 
 
-def test_a_motion_is_the_same_alone_and_in_company_and_differs_with_its_seed(sources: Sources) -> None:
+def test_a_motion_does_not_depend_on_the_batch_and_depends_on_its_seed(sources: Sources) -> None:
     family = load_family("text2hoi").load(sources)
     short, long = samples_of(sources.annotated, "test")
-    asked = requests_for(short, PredictionConfig(samples=2))
-    together = family.sample([*asked, *requests_for(long, PredictionConfig(samples=1))])
-    (alone,) = family.sample(asked[:1])
+    requests = requests_for(short, PredictionConfig(samples=2))
+    together = family.sample([*requests, *requests_for(long, PredictionConfig(samples=1))])
+    (alone,) = family.sample(requests[:1])
     np.testing.assert_allclose(joints_of(alone), joints_of(together[0]), atol=1e-4)
     assert abs(joints_of(together[0]) - joints_of(together[1])).max() > 1e-3
 
 
-def test_the_words_and_the_order_of_refinement_reach_the_motion(sources: Sources) -> None:
+def test_a_motion_depends_on_the_sentence_and_on_refinement(sources: Sources) -> None:
     model = load_family("text2hoi").load(sources)
     assert isinstance(model, Text2Hoi)
     sample = samples_of(sources.annotated, "test")[0]
@@ -196,9 +200,9 @@ def test_the_words_and_the_order_of_refinement_reach_the_motion(sources: Sources
     np.testing.assert_allclose(
         joints_of(refined) - joints_of(coarse), np.broadcast_to(shift, joints_of(coarse).shape), atol=1e-5
     )
-    (made,) = model.motions([request])
-    assert (made.refined != made.coarse).any()
-    answered = [*model.sample([request]), *model.clips([request], [made], refined=True)]
+    (motion,) = model.motions([request])
+    assert (motion.refined != motion.coarse).any()
+    answered = [*model.sample([request]), *model.clips([request], [motion], refined=True)]
     np.testing.assert_array_equal(*map(joints_of, answered))
     plain = load_family("text2hoi-coarse").load(sources).sample([request])[0]
     unrefined = model.clips([request], model.motions([request], refined=False), refined=False)[0]
@@ -206,49 +210,53 @@ def test_the_words_and_the_order_of_refinement_reach_the_motion(sources: Sources
 
 
 def test_sampling_in_16_bits_moves_hands_by_less_than_a_millimetre_float16_less_than_bfloat16(sources: Sources) -> None:
-    requests = [requests_for(own, PredictionConfig(samples=1))[0] for own in samples_of(sources.annotated, "test")]
+    requests = [requests_for(item, PredictionConfig(samples=1))[0] for item in samples_of(sources.annotated, "test")]
     hands = {}
     for precision in ("float32", "bfloat16", "float16"):
-        told = {"text2hoi": {**FAST["text2hoi"], "precision": precision}}
-        model = load_family("text2hoi").load(replace(sources, settings=told))
+        settings = {"text2hoi": {**FAST["text2hoi"], "precision": precision}}
+        model = load_family("text2hoi").load(replace(sources, settings=settings))
         assert isinstance(model, Text2Hoi)
-        hands[precision] = torch.cat([own.coarse[..., :3].flatten() for own in model.motions(requests, refined=False)])
-    moved = {name: float((own - hands["float32"]).abs().max()) for name, own in hands.items()}
+        hands[precision] = torch.cat(
+            [item.coarse[..., :3].flatten() for item in model.motions(requests, refined=False)]
+        )
+    moved = {name: float((item - hands["float32"]).abs().max()) for name, item in hands.items()}
     assert 0 < moved["float16"] < moved["bfloat16"] < 1e-3
 
 
-def test_a_hold_takes_the_refiners_place_where_told_or_where_hands_are_given_in_the_objects_frame(
+def test_contact_refinement_replaces_the_refiner_by_setting_or_in_the_object_frame(
     sources: Sources, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
     usual = load_family("text2hoi").load(sources)
-    told = {"text2hoi": {**FAST["text2hoi"], "refined_by": "contact_refinement"}}
-    model = load_family("text2hoi").load(replace(sources, settings=told))
+    settings = {"text2hoi": {**FAST["text2hoi"], "refined_by": "contact_refinement"}}
+    model = load_family("text2hoi").load(replace(sources, settings=settings))
     assert isinstance(model, Text2Hoi)
     assert isinstance(usual, Text2Hoi)
     assert (usual.refined_by, model.refined_by) == ("network", "contact_refinement")
     (motion,) = model.motions([request])
     assert torch.equal(motion.refined, motion.coarse)
-    (before,), (held,) = (model.clips([request], [motion], refined=kind) for kind in (False, True))
+    (before,), (refined,) = (model.clips([request], [motion], refined=kind) for kind in (False, True))
     for side, track in hold_hands(HANDS, before).items():
-        np.testing.assert_array_equal(held.hands[side].hand_pose, track.hand_pose)
+        np.testing.assert_array_equal(refined.hands[side].hand_pose, track.hand_pose)
     in_object = MotionRepresentation(MotionRepresentationConfig(4, hand_frame="object"))
     monkeypatch.setattr(usual.trained["diffusion"].network, "representation", in_object)
     assert usual.refined_by == "contact_refinement"
 
 
-def test_requests_share_a_batch_with_those_of_the_same_hands_and_of_like_length(sources: Sources) -> None:
+def test_requests_are_batched_by_hands_and_length(sources: Sources) -> None:
     (request,) = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))
     flags, draws = ((True, False), (False, True), (True, True)), np.random.default_rng(0)
-    asked = [
+    requests = [
         replace(request, active_hands=np.array(flags[draws.integers(3)]), n_frames=int(draws.integers(8, 151)))
         for _ in range(4 * MAX_BATCH_SIZE)
     ]
-    batches = bucket_by_length(asked)
-    assert sorted(number for own in batches for number in own) == list(range(len(asked)))
-    assert all(len(own) <= MAX_BATCH_SIZE and len({tuple(asked[n].active_hands) for n in own}) == 1 for own in batches)
-    lengths = [[asked[number].n_frames for number in own] for own in batches]
-    assert all(own == sorted(own) for own in lengths)
+    batches = bucket_by_length(requests)
+    assert sorted(number for batch in batches for number in batch) == list(range(len(requests)))
+    assert all(
+        len(batch) <= MAX_BATCH_SIZE and len({tuple(requests[n].active_hands) for n in batch}) == 1 for batch in batches
+    )
+    lengths = [[requests[number].n_frames for number in batch] for batch in batches]
+    assert all(batch == sorted(batch) for batch in lengths)
     assert len(batches) <= 4 + len(flags)
 
 
@@ -266,34 +274,32 @@ def test_requests_share_a_batch_with_those_of_the_same_hands_and_of_like_length(
          "all are unusual or of another verb", "none is usual and carries",
          "another verb is unusual, too, and counts once", "the second is less unusual", "the third is"],
 )  # fmt: skip
-def test_a_motion_whose_hands_cannot_carry_or_that_does_as_another_verb_says_is_drawn_again(
+def test_motions_that_cannot_carry_or_show_another_verb_are_resampled(
     sources: Sources, monkeypatch: pytest.MonkeyPatch, shares: tuple[float, ...], others: str, taken: int, draws: int
 ) -> None:
     request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
-    told = {"text2hoi": {**FAST["text2hoi"], "refined_by": "contact_refinement", "max_attempts": 3}}
-    model = load_family("text2hoi").load(replace(sources, settings=told))
+    settings = {"text2hoi": {**FAST["text2hoi"], "refined_by": "contact_refinement", "max_attempts": 3}}
+    model = load_family("text2hoi").load(replace(sources, settings=settings))
     assert isinstance(model, Text2Hoi)
-    found, left, verbs = list[Clip](), list(shares), list(others)
+    sampled, left, verbs = list[Clip](), list(shares), list(others)
 
     def carried_share(pair: HandPair, clip: Clip, settings: HoldSettings) -> float:
-        found.append(clip)
+        sampled.append(clip)
         return left.pop(0)
 
     monkeypatch.setattr("models.text2hoi.sampler.carried_share", carried_share)
     monkeypatch.setattr(VerbCheck, "moved_as", lambda self, numbers: verbs.pop(0))
-    beyond = iter([{"u": 0.5, "b": 1.0, "v": 2.0}.get(own, 0.0) for own in others])
-    monkeypatch.setattr(VerbCheck, "beyond", lambda self, asked, numbers: next(beyond))
+    beyond = iter([{"u": 0.5, "b": 1.0, "v": 2.0}.get(nearest_verb, 0.0) for nearest_verb in others])
+    monkeypatch.setattr(VerbCheck, "beyond", lambda self, verb, numbers: next(beyond))
     monkeypatch.setattr(VerbCheck, "fails", lambda self, request, moved_as: moved_as in "yb")
     (answer,) = model.answers([request])
-    assert (answer.attempts, len(found), left) == (draws, draws, [])
-    assert (answer.carried, answer.clip, answer.moved_as) == (shares[taken], found[taken], others[taken])
-    for one, other in pairwise(found):
+    assert (answer.draws, len(sampled), left) == (draws, draws, [])
+    assert (answer.carried, answer.clip, answer.moved_as) == (shares[taken], sampled[taken], others[taken])
+    for one, other in pairwise(sampled):
         assert abs(joints_of(one) - joints_of(other)).max() > 1e-3
 
 
-def test_only_a_hold_asks_whether_hands_carry_and_what_the_object_does(
-    sources: Sources, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_contact_refinement_checks_carrying_and_verb(sources: Sources, monkeypatch: pytest.MonkeyPatch) -> None:
     request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
     model = load_family("text2hoi").load(sources)
     assert isinstance(model, Text2Hoi)
@@ -302,7 +308,7 @@ def test_only_a_hold_asks_whether_hands_carry_and_what_the_object_does(
     assert [answer.attempts for answer in model.answers([request])] == [1]
 
 
-def test_sampling_writes_an_ordinary_store_and_the_familys_own_figures(
+def test_sampling_writes_a_store_and_the_diagnostics_of_the_family(
     annotated_root: Path, trained: Path, tmp_path: Path
 ) -> None:
     family, params = load_family("text2hoi"), {"samples": 2, "seed": 1}
@@ -312,9 +318,9 @@ def test_sampling_writes_an_ordinary_store_and_the_familys_own_figures(
     store = open_store(tmp_path / "a" / "clips", HANDS)
     assert store.ids == ["toy/s3/5~0", "toy/s3/5~1", "toy/s3/6~0", "toy/s3/6~1"]
     assert store.clip("toy/s3/6~1").n_frames == 33
-    asked = read_asked(tmp_path / "a" / "clips")
-    assert list(asked) == store.ids
-    assert all(contact_map.shape == (1024,) and contact_map.any() for contact_map in asked.values())
+    targets = read_asked(tmp_path / "a" / "clips")
+    assert list(targets) == store.ids
+    assert all(contact_map.shape == (1024,) and contact_map.any() for contact_map in targets.values())
     figures = json.loads((tmp_path / "a" / "diagnostics.json").read_text())
     assert {"f1", "f1_mean_map", "f1_mean_map_by_index", "f1_mean_map_by_position"} <= set(figures["contact"])
     # Training lengths 24, 32, 28 with mean 28; test lengths 24 and 33.
@@ -327,22 +333,22 @@ def test_sampling_writes_an_ordinary_store_and_the_familys_own_figures(
             assert path.read_bytes() == (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes(), path
 
 
-def test_the_contact_map_a_motion_was_drawn_for_is_told_by_families_that_draw_one(
+def test_families_report_the_sampled_contact_map(
     sources: Sources, annotated_root: Path, trained: Path, tmp_path: Path
 ) -> None:
     requests = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=2))
     model = load_family("text2hoi").load(sources)
     assert isinstance(model, Text2Hoi)
-    told = [motion.contact_map.numpy() == 1 for motion in model.motions(requests, refined=False)]
+    sampled_maps = [motion.contact_map.numpy() == 1 for motion in model.motions(requests, refined=False)]
     for family in ("text2hoi", "text2hoi-coarse"):
         sampler = load_family(family).load(sources)
         assert isinstance(sampler, ReportsContact)
-        np.testing.assert_array_equal(sampler.sample_asked(requests)[1], told)
+        np.testing.assert_array_equal(sampler.sample_asked(requests)[1], sampled_maps)
     sample_family(load_family("nearest-clip"), annotated_root, trained, tmp_path / "a", {"samples": 1}, HANDS)
     assert read_asked(tmp_path / "a" / "clips") == {}
 
 
-def test_a_family_that_cannot_answer_says_why(annotated_root: Path, trained: Path, tmp_path: Path) -> None:
+def test_a_family_that_cannot_answer_gives_the_reason(annotated_root: Path, trained: Path, tmp_path: Path) -> None:
     counts = sample_family(load_family("text2hoi"), annotated_root, tmp_path, tmp_path / "a", {}, HANDS)
     assert counts == {"clips": 0}
     note = json.loads((tmp_path / "a" / "empty.json").read_text())
@@ -372,5 +378,5 @@ def test_the_best_threshold_separates_the_maps() -> None:
 
 def test_the_mean_map_by_position_reads_the_nearest_training_points() -> None:
     cloud = np.array([[0.0, 0, 0], [1.0, 0, 0]])
-    found = mean_map_by_position(np.array([[0.9, 0, 0], [0.1, 0, 0]]), [cloud, cloud], np.array([[1, 0], [1, 1]]))
-    np.testing.assert_allclose(found, [0.5, 1.0])
+    mean_map = mean_map_by_position(np.array([[0.9, 0, 0], [0.1, 0, 0]]), [cloud, cloud], np.array([[1, 0], [1, 1]]))
+    np.testing.assert_allclose(mean_map, [0.5, 1.0])

@@ -1,4 +1,4 @@
-"""What a person would see to be wrong with a motion is told; a difference of some centimetres is not."""
+"""Faults of a motion that a person would see are reported; differences of some centimetres are not."""
 
 from dataclasses import replace
 
@@ -46,33 +46,34 @@ def points() -> ObjectPoints:
 def check(points: ObjectPoints) -> VerbCheck:
     """Of lifts, usually by 19 to 21 cm, and of objects that nobody moved."""
     nothing = VerbCheck(learn_actions({}), 0.02, HANDS)
-    clips = {"lift": [lift(rise_m=share * RISE) for share in (0.95, 1.0, 1.05)], "touch": [lift(rise_m=0 * RISE)] * 3}
-    numbers = {verb: [nothing.numbers(clip, points) for clip in own] for verb, own in clips.items()}
+    clips = {
+        "lift": [lift(rise_m=fraction * RISE) for fraction in (0.95, 1.0, 1.05)],
+        "touch": [lift(rise_m=0 * RISE)] * 3,
+    }
+    numbers = {verb: [nothing.numbers(clip, points) for clip in verb_clips] for verb, verb_clips in clips.items()}
     usual = {"lift": {"rise_m": (0.19, 0.21), "path_m": (0.19, 0.21)}}
     return VerbCheck(replace(learn_actions(numbers), usual=usual), 0.02, HANDS, 1.0)
 
 
-@pytest.mark.parametrize("share", [0.7, 0.95, 1.0, 1.3])
-def test_nothing_is_said_of_a_lift_or_of_one_a_little_higher_or_lower(
-    share: float, points: ObjectPoints, check: VerbCheck
-) -> None:
-    clip = lift(rise_m=share * RISE)
+@pytest.mark.parametrize("fraction", [0.7, 0.95, 1.0, 1.3])
+def test_a_usual_lift_has_no_fault(fraction: float, points: ObjectPoints, check: VerbCheck) -> None:
+    clip = lift(rise_m=fraction * RISE)
     assert visible_faults(clip, points, HANDS, check, "lift") == ()
     unusual = check.unusual("lift", check.numbers(clip, points))
-    assert bool(unusual) == (share in (0.7, 1.3))  # which the page has in numbers
+    assert bool(unusual) == (fraction in (0.7, 1.3))  # which the page has in numbers
 
 
-@pytest.mark.parametrize("share", [0.3, 2.0])
-def test_a_lift_that_is_seen_to_be_another_is_told_with_its_numbers(
-    share: float, points: ObjectPoints, check: VerbCheck
+@pytest.mark.parametrize("fraction", [0.3, 2.0])
+def test_a_visibly_different_lift_is_reported_with_its_numbers(
+    fraction: float, points: ObjectPoints, check: VerbCheck
 ) -> None:
-    (fault,) = visible_faults(lift(rise_m=share * RISE), points, HANDS, check, "lift")
+    (fault,) = visible_faults(lift(rise_m=fraction * RISE), points, HANDS, check, "lift")
     assert fault.startswith("unlike 'lift' in training")
-    assert f"highest rise {20 * share:.3g} cm (usual: " in fault
-    assert (", more like 'touch': " in fault) == (share == 0.3)
+    assert f"highest rise {20 * fraction:.3g} cm (usual: " in fault
+    assert (", more like 'touch': " in fault) == (fraction == 0.3)
 
 
-def test_an_object_that_stays_is_told_where_the_verb_moves_it(points: ObjectPoints, check: VerbCheck) -> None:
+def test_a_static_object_is_a_fault_if_the_verb_moves_it(points: ObjectPoints, check: VerbCheck) -> None:
     still = lift(rise_m=0 * RISE)
     assert visible_faults(still, points, HANDS, check, "lift") == ("the object does not move",)
     assert visible_faults(still, points, HANDS, check, "touch") == ()
@@ -80,25 +81,25 @@ def test_an_object_that_stays_is_told_where_the_verb_moves_it(points: ObjectPoin
 
 
 @pytest.mark.parametrize("gap_m", [0.008, 0.012, 0.3])
-def test_a_hand_that_never_touches_is_told_from_a_centimetre_on(gap_m: float, points: ObjectPoints) -> None:
+def test_a_hand_without_contact_is_reported_from_one_centimetre(gap_m: float, points: ObjectPoints) -> None:
     said = visible_faults(lift(-gap_m), points, HANDS, None, None)
     expected = (f"the right hand never touches the object ({gap_m * 100:.1f} cm away)",)
     assert said == (expected if gap_m > 0.01 else ())
 
 
-def test_a_hand_as_deep_as_a_finger_is_thick_is_told_with_its_depth(points: ObjectPoints) -> None:
+def test_penetration_by_the_thickness_of_a_finger_is_reported(points: ObjectPoints) -> None:
     shallow, deep = (visible_faults(lift(depth), points, HANDS, None, None) for depth in (0.015, 0.025))
     assert shallow == ()
     assert deep == (f"the right hand is up to 2.5 cm inside the object in {FRAMES} frames",)
 
 
-def test_an_object_that_floats_is_told(points: ObjectPoints) -> None:
+def test_a_floating_object_is_reported(points: ObjectPoints) -> None:
     """The hand lies on the box first, then rises faster than it does."""
     floats = int((RISE > 0.02).sum())
     expected = f"the object is in the air and no hand touches it in {floats} frames"
     assert visible_faults(lift(hand_rise_m=3 * RISE), points, HANDS, None, None) == (expected,)
 
 
-def test_hands_that_take_no_part_are_not_asked_for(points: ObjectPoints) -> None:
+def test_inactive_hands_are_not_checked(points: ObjectPoints) -> None:
     assert not any(lift().hands[side].valid.any() for side in SIDES[:1])
     assert visible_faults(lift(), points, HANDS, None, None) == ()

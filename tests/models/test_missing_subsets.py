@@ -1,4 +1,4 @@
-"""Without validation clips nothing is chosen; what has no training clips to rest on is left out with the reason."""
+"""Missing subsets: without validation clips nothing is selected; without training clips the reason is reported."""
 
 import json
 from dataclasses import replace
@@ -47,7 +47,7 @@ def train(name: str, root: Path, out: Path, **training) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["length", "contact", "manipnet"])
-def test_without_validation_clips_the_last_weights_are_kept_whatever_the_losses_were(
+def test_without_validation_clips_the_last_weights_are_used(
     root: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture
 ) -> None:
     """The best of the validations chooses nothing. The log has no loss."""
@@ -58,7 +58,7 @@ def test_without_validation_clips_the_last_weights_are_kept_whatever_the_losses_
     assert all(torch.equal(value, last[key]) for key, value in chosen.items())
     header, *rows = (tmp_path / "chosen" / name / "log.csv").read_text().splitlines()
     assert header.startswith("step,validation,")
-    assert [row.split(",")[:2] for row in rows] == [[str(step), ""] for step in range(1, 5)]
+    assert [line.split(",")[:2] for line in rows] == [[str(step), ""] for step in range(1, 5)]
     info = load_checkpoint(tmp_path / "chosen" / name, load_network(name)).info
     assert info["results"]["validation_loss"] is None
     assert info["facts"]["clips"]["validation"] == []
@@ -72,7 +72,7 @@ def test_diffusion_and_refiner_train_without_validation_clips(root: Path, tmp_pa
 
 
 @pytest.mark.slow
-def test_thresholds_that_no_validation_clip_chooses_are_one_half(
+def test_thresholds_without_validation_clips_are_one_half(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also those of the mean maps that the network is compared with: no training clip chooses for them."""
@@ -95,7 +95,7 @@ def test_a_corpus_holds_out_no_training_clip(root: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_evaluator_keeps_the_first_seed_and_says_nothing_of_validation(root: Path, tmp_path: Path) -> None:
+def test_without_validation_clips_the_evaluator_uses_the_first_seed(root: Path, tmp_path: Path) -> None:
     settings = EvaluatorSettings(("corrected", "text-motion"), seeds=(5, 1, 2), most_steps=4)
     train_evaluators(root, tmp_path, settings)
     info = json.loads((tmp_path / "info.json").read_text())
@@ -106,19 +106,19 @@ def test_the_evaluator_keeps_the_first_seed_and_says_nothing_of_validation(root:
 
 
 @pytest.mark.slow
-def test_validation_clips_of_unknown_labels_choose_nothing_either(tmp_path: Path) -> None:
+def test_validation_clips_of_untrained_labels_select_nothing(tmp_path: Path) -> None:
     """Their loss was no number, and the weights that training began with were kept."""
     plans = [replace(plan, verb="pour") if plan.subject == "s2" else plan for plan in TOY_MOTIONS]
     root = write_annotated(tmp_path / "data", [make_clip(number, plan) for number, plan in enumerate(plans)])
     settings = EvaluatorSettings(("corrected",), seeds=(3, 1), most_steps=4)
     info = train_evaluators(root, tmp_path / "out", settings)
     assert not isinstance(info, str)
-    found = info["evaluators"]["corrected"]
-    assert (found["seed"], set(found["accuracy"])) == (3, {"train", "test"})
+    evaluator = info["evaluators"]["corrected"]
+    assert (evaluator["seed"], set(evaluator["accuracy"])) == (3, {"train", "test"})
 
 
 @pytest.mark.parametrize("family", ["mean-pose", "mean-motion", "mean-pose-at-object"])
-def test_a_mean_without_a_training_clip_of_the_hand_is_left_out(
+def test_a_mean_without_training_clips_of_the_hand_has_a_reason(
     annotated: AnnotatedStore, tmp_path: Path, family: str
 ) -> None:
     """Only clips of the right hand train; the left one had no motion at all under the name of a mean."""
@@ -137,24 +137,24 @@ def test_without_training_clips_there_is_no_nearest_window(tmp_path: Path) -> No
     rule = {"by": "subject", "train": ["s9"], "test": ["s1"], "promises": []}
     store = load_annotated(write_annotated(tmp_path, [make_clip(0, TOY_MOTIONS[0])], rule=rule))
     sampler = load_family("nearest-window").load(Sources(store, tmp_path, HANDS, torch.device("cpu")))
-    asked = requests_for(HoiDataset(store, "test", crop="start")[0], PredictionConfig(samples=1))
-    assert [type(answer) for answer in sampler.sample(asked)] == [LeftOut]
+    requests = requests_for(HoiDataset(store, "test", crop="start")[0], PredictionConfig(samples=1))
+    assert [type(answer) for answer in sampler.sample(requests)] == [LeftOut]
 
 
 def test_a_clip_whose_sentence_all_test_clips_have_gets_no_other_prompt(tmp_path: Path, trained: Path) -> None:
-    """It was told its own, and counted as one that was told another."""
+    """It would be conditioned on its own sentence and still count as a control."""
     plans = [replace(TOY_MOTIONS[5]), replace(TOY_MOTIONS[0]), replace(TOY_MOTIONS[1])]
     store = load_annotated(write_annotated(tmp_path, [make_clip(number, plan) for number, plan in enumerate(plans)]))
     sources = Sources(store, trained, HANDS, torch.device("cpu"))
     assert other_prompts(sources) == {}
     sample = HoiDataset(store, "test", crop="start")[0]
-    asked = requests_for(sample, PredictionConfig(samples=1))
+    requests = requests_for(sample, PredictionConfig(samples=1))
     for family in ("other-prompt", "other-prompt-own-contact"):
-        answers = load_family(family).load(sources).sample(asked)
-        assert answers == [LeftOut(asked[0].motion_id, "all test clips have its sentence")]
+        answers = load_family(family).load(sources).sample(requests)
+        assert answers == [LeftOut(requests[0].motion_id, "all test clips have its sentence")]
 
 
-def test_bimart_is_told_another_object_only_where_there_is_one(tmp_path: Path) -> None:
+def test_bimart_gets_another_object_only_if_there_is_one(tmp_path: Path) -> None:
     plans = [
         TOY_MOTIONS[0],
         TOY_MOTIONS[1],
@@ -163,11 +163,11 @@ def test_bimart_is_told_another_object_only_where_there_is_one(tmp_path: Path) -
     ]  # boxes, and a notebook that tests with the last box
     plans[3] = replace(plans[3], subject="s3")
     store = load_annotated(write_annotated(tmp_path, [make_clip(number, plan) for number, plan in enumerate(plans)]))
-    asked = {
+    requests = {
         sample.object_model.name: requests_for(sample, PredictionConfig(samples=1))[0]
         for sample in HoiDataset(store, "test", crop="start")
     }
-    box, notebook = asked[TOY_MOTIONS[0].model.name], asked[TOY_MOTIONS[2].model.name]
+    box, notebook = requests[TOY_MOTIONS[0].model.name], requests[TOY_MOTIONS[2].model.name]
     left_out = {
         change: [HandsForPaths(None, HANDS, None, True, change, store)._why_not(one) for one in (box, notebook)]  # type: ignore[arg-type]
         for change in ("other object", "other path", "none")

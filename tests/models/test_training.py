@@ -346,7 +346,7 @@ def test_visible_differences_are_reported_and_the_page_has_the_others(
     }
     page = (tmp_path / "open" / "index.html").read_text()
     assert "the best of 5 motions" in page
-    assert "sample 1: moves most like &#39;open&#39;, rise_m 9 (usual: 0 to 1), path_m 8" in page
+    assert "sample 1: motion classified as &#39;open&#39;, rise_m 9 (usual: 0 to 1), path_m 8" in page
 
 
 def test_a_generated_clip_is_finite_and_starts_with_the_object_at_the_origin(trained: Path) -> None:

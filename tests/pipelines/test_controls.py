@@ -1,4 +1,4 @@
-"""The stage that makes control rows, and the check that every row loses what it must."""
+"""The stage of negative controls, and the check of their expected orderings."""
 
 import json
 import shutil
@@ -12,9 +12,9 @@ import yaml
 from typer.testing import CliRunner
 
 from hoidata.hands import load_embedded_hands
-from hoidata.metrics.asked_metrics import with_lists
 from hoidata.metrics.evaluate import evaluate_store
 from hoidata.metrics.feature_metrics import FEATURE_METRICS
+from hoidata.metrics.optional_metrics import with_lists
 from hoidata.store.store import open_store
 from models.common.predicting import sample_family
 from models.evaluator.encoders import load_evaluators
@@ -22,7 +22,16 @@ from models.evaluator.settings import EvaluatorSettings
 from models.evaluator.stage import train_evaluators
 from models.registry import family_names, load_family
 from pipelines.cli import app
-from pipelines.promises import CONFUSED, PROMISES, TRUTH, Promise, datasets_below, kept, read_rows, taken_for_reverse
+from pipelines.expected_orderings import (
+    CONFUSED,
+    EXPECTED_ORDERINGS,
+    RECORDED,
+    ExpectedOrdering,
+    check_orderings,
+    datasets_below,
+    read_methods,
+    taken_for_reverse,
+)
 from pipelines.stages import controls, evaluate
 from pipelines.stages.base import StagePaths, empty_reason
 from tests.builders.annotated import write_annotated_dataset
@@ -36,7 +45,7 @@ SAMPLES, METRICS_OF = Path("samples/embedded/grab/controls"), Path("metrics/embe
 
 @pytest.fixture
 def project(tmp_path, monkeypatch, make_clip):
-    """An annotated dataset where the stage looks for it."""
+    """An annotated dataset in the folder that the stage reads."""
     shutil.copytree(PROJECT / "manifests" / "embedded", tmp_path / "manifests" / "embedded")
     monkeypatch.chdir(tmp_path)
     write_annotated_dataset(PATHS.data, make_clip)
@@ -54,7 +63,7 @@ def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_without_rows_the_stage_says_so_and_imports_no_torch(project):
+def test_without_controls_the_stage_gives_the_reason_and_imports_no_torch(project):
     Path("params.yaml").write_text("{profile: embedded, controls: {}}")
     code = (
         "import sys; from pipelines.stages import controls; from pipelines.stages.base import StagePaths;"
@@ -64,23 +73,23 @@ def test_without_rows_the_stage_says_so_and_imports_no_torch(project):
     assert empty_reason(SAMPLES) == "off: params.yaml names no families under controls"
 
 
-def test_every_row_gets_motions_and_figures_and_rows_no_longer_asked_for_go(project):
+def test_every_control_is_sampled_and_evaluated_and_removed_controls_are_deleted(project):
     run_with(families=["static", "reversed"])
     assert names(SAMPLES) == {"static", "reversed"}
     assert names(METRICS_OF) == {"static.json", "reversed.json"}
-    found = json.loads((METRICS_OF / "static.json").read_text())
-    assert found["held_out_clips"] == 2
-    assert found["motions"] == len(open_store(SAMPLES / "static" / "clips").ids)
+    results = json.loads((METRICS_OF / "static.json").read_text())
+    assert results["held_out_clips"] == 2
+    assert results["motions"] == len(open_store(SAMPLES / "static" / "clips").ids)
     before = (METRICS_OF / "static.json").read_bytes()
     run_with(families=["static"])
     assert names(SAMPLES) == {"static"}
     assert names(METRICS_OF) == {"static.json"}
     assert (METRICS_OF / "static.json").read_bytes() == before
     run_with(families=["static"], samples=3)
-    assert json.loads((METRICS_OF / "static.json").read_text())["motions"] == found["motions"] * 3 // 2
+    assert json.loads((METRICS_OF / "static.json").read_text())["motions"] == results["motions"] * 3 // 2
 
 
-def test_rows_of_an_optional_family_are_sampled_by_its_own_stage(project, monkeypatch):
+def test_controls_of_an_optional_family_are_sampled_by_the_stage_of_that_family(project, monkeypatch):
     """It alone waits for the networks of that family."""
     settings = {"profile": "embedded", "sample": {}, "controls": {"families": ["static", "bimart-zero-map"]}}
     Path("params.yaml").write_text(yaml.safe_dump(settings))
@@ -91,14 +100,14 @@ def test_rows_of_an_optional_family_are_sampled_by_its_own_stage(project, monkey
     assert sampled == [("controls/static", "static"), ("controls-bimart/bimart-zero-map", "bimart-zero-map")]
 
 
-def test_a_clip_left_out_of_a_row_stands_in_its_metrics_with_the_reason_of_the_row(project):
+def test_metrics_list_a_skipped_clip_with_the_reason_of_the_control(project):
     """No training clip of both hands, and one of the right hand."""
     run_with(families=["random-clip"])
     (left_out,) = json.loads((METRICS_OF / "random-clip.json").read_text())["left_out"]
     assert left_out == {"clip_id": "toy/s3/3", "reason": "no training clip of this hand"}
 
 
-ROWS = {
+METHODS = {
     "ground-truth": {"figures": {"contact_f1": 0.9, "fid": 0.25}, "intervals": {"contact_f1": {"clips": [0.8, 1.0]}}},
     "half-blind": {"figures": {"contact_f1": 0.85, "fid": 0.25}},
     "blind": {"figures": {"contact_f1": 0.5, "fid": 0.2500001}},
@@ -118,9 +127,9 @@ ROWS = {
         ("missing", "fid", "rise", None),
     ],
 )
-def test_a_promise_is_kept_beyond_the_interval_of_the_row_it_is_held_against(control, metric, must, holds):
-    (found,) = kept(ROWS, [Promise(control, metric, must)])
-    assert found.holds is holds
+def test_an_ordering_holds_beyond_the_interval_of_the_reference(control, metric, must, holds):
+    (results,) = check_orderings(METHODS, [ExpectedOrdering(control, metric, must)])
+    assert results.holds is holds
 
 
 def test_motions_taken_for_their_reverse_are_counted_among_verbs_that_have_one():
@@ -129,14 +138,16 @@ def test_motions_taken_for_their_reverse_are_counted_among_verbs_that_have_one()
     assert taken_for_reverse({"labels": ["lift"], "confusion": [[1]]}) is None
 
 
-def test_promises_name_families_and_metrics_there_are():
-    known = {metric.name for metric in (*with_lists(["bimart"]), *FEATURE_METRICS)}
-    known |= {f"{CONFUSED} {name}" for name in ("paper", "corrected")}
-    assert {promise.metric for promise in PROMISES} <= known
-    assert {name for promise in PROMISES for name in (promise.control, promise.beside)} <= set(family_names())
+def test_orderings_name_registered_families_and_metrics():
+    metrics = {metric.name for metric in (*with_lists(["bimart"]), *FEATURE_METRICS)}
+    metrics |= {f"{CONFUSED} {name}" for name in ("paper", "corrected")}
+    assert {ordering.metric for ordering in EXPECTED_ORDERINGS} <= metrics
+    assert {name for ordering in EXPECTED_ORDERINGS for name in (ordering.control, ordering.reference)} <= set(
+        family_names()
+    )
 
 
-def test_the_command_lists_promises_and_fails_where_one_is_broken(tmp_path):
+def test_the_command_lists_orderings_and_fails_if_one_is_broken(tmp_path):
     folder = tmp_path / "metrics" / "study" / "grab"
     (folder / "controls").mkdir(parents=True)
     write = {
@@ -150,14 +161,14 @@ def test_the_command_lists_promises_and_fails_where_one_is_broken(tmp_path):
     assert done.exit_code == 1
     lines = [line.split() for line in done.output.splitlines() if line.strip().startswith("hands-away")]
     assert [(line[1], line[-1]) for line in lines] == [("contact_f1", "yes"), ("realism_si", "NO")]
-    assert f"1 hold, 1 do not, {len(PROMISES) - 2} were not measured" in done.output
+    assert f"1 hold, 1 do not, {len(EXPECTED_ORDERINGS) - 2} were not measured" in done.output
 
 
 OF_MODELS = {"bimart", "text2hoi", "other-prompt", "other-contact"}
 
 
 @pytest.mark.long
-def test_every_promise_that_needs_no_model_holds_on_a_small_part_of_the_study_corpus(tmp_path):
+def test_every_ordering_without_a_model_holds_on_a_small_part_of_the_study_corpus(tmp_path):
     """A lidded box opened, closed, lifted and pushed by one hand; the evaluator learns from one subject in a moment."""
     hands, verbs = load_embedded_hands(), ("open", "close", "lift", "push")
     data = write_annotated(
@@ -165,49 +176,51 @@ def test_every_promise_that_needs_no_model_holds_on_a_small_part_of_the_study_co
     )
     train_evaluators(data, tmp_path / "made", EvaluatorSettings(("paper", "corrected", "text-motion"), most_steps=150))
     encoders = load_evaluators(tmp_path / "made")
-    asked = [promise for promise in PROMISES if not {promise.control, promise.beside} & OF_MODELS]
-    looked_at, rows = {promise.metric for promise in asked}, {}
-    for name in sorted({name for promise in asked for name in (promise.control, promise.beside)}):
+    orderings = [ordering for ordering in EXPECTED_ORDERINGS if not {ordering.control, ordering.reference} & OF_MODELS]
+    metric_names, methods = {ordering.metric for ordering in orderings}, {}
+    for name in sorted({name for ordering in orderings for name in (ordering.control, ordering.reference)}):
         sample_family(load_family(name), data, tmp_path, tmp_path / name, {"samples": 1}, hands)
-        metrics = tuple(metric for metric in with_lists(["bimart"]) if metric.name in looked_at)
-        rows[name] = evaluate_store(tmp_path / name / "clips", data, hands, metrics=metrics, encoders=encoders)
-    assert rows[TRUTH]["figures"]["accuracy_top1_corrected"] >= 0.85
-    found = kept(rows, asked)  # what needs more clips than these, as a Frechet distance, is not measured
-    assert [item for item in found if item.holds is False] == []
-    assert {item.promise.control for item in found if item.holds} == {promise.control for promise in asked}
+        metrics = tuple(metric for metric in with_lists(["bimart"]) if metric.name in metric_names)
+        methods[name] = evaluate_store(tmp_path / name / "clips", data, hands, metrics=metrics, encoders=encoders)
+    assert methods[RECORDED]["figures"]["accuracy_top1_corrected"] >= 0.85
+    results = check_orderings(
+        methods, orderings
+    )  # what needs more clips than these, as a Frechet distance, is not measured
+    assert [item for item in results if item.holds is False] == []
+    assert {item.ordering.control for item in results if item.holds} == {ordering.control for ordering in orderings}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("profile", ["study", "embedded"])
-def test_every_promise_holds_on_what_was_measured_here(profile):
+def test_every_ordering_holds_on_the_metrics_in_this_folder(profile):
     folder = PROJECT / "metrics" / profile
     if not any(folder.rglob("controls/object-moved.json")):
         pytest.skip(f"no control rows of the profile {profile} have been measured here")
     broken = [
-        (dataset.name, item.promise.control, item.promise.metric, item.reference, item.value)
+        (dataset.name, item.ordering.control, item.ordering.metric, item.reference, item.value)
         for dataset in datasets_below(folder)
-        for item in kept(read_rows(dataset))
+        for item in check_orderings(read_methods(dataset))
         if item.holds is False
     ]
     assert broken == []
 
 
-def test_an_expected_ordering_that_was_not_measured_says_why(tmp_path):
-    rows = {
+def test_an_unmeasured_ordering_has_a_reason(tmp_path):
+    methods = {
         "ground-truth": {"figures": {"contact_f1": 1.0}, "unmeasured": {"realism_si": {"gravity is not known": 28}}},
         "static": {"empty": "no motions"},
     }
-    for name, row in rows.items():
-        (tmp_path / f"{name}.json").write_text(json.dumps(row))
-    asked = [
-        Promise("ground-truth", "realism_si", "fall"),
-        Promise("static", "contact_f1", "fall"),
-        Promise("noise", "contact_f1", "fall"),
+    for name, content in methods.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(content))
+    orderings = [
+        ExpectedOrdering("ground-truth", "realism_si", "fall"),
+        ExpectedOrdering("static", "contact_f1", "fall"),
+        ExpectedOrdering("noise", "contact_f1", "fall"),
     ]
-    found = kept(read_rows(tmp_path), asked)
-    assert [item.holds for item in found] == [None] * 3
-    assert found[0].why.startswith("ground-truth: gravity is not known: 28 clips")
-    assert [item.why for item in found[1:]] == ["static: no motions", "noise was not evaluated"]
+    results = check_orderings(read_methods(tmp_path), orderings)
+    assert [item.holds for item in results] == [None] * 3
+    assert results[0].reason.startswith("ground-truth: gravity is not known: 28 clips")
+    assert [item.reason for item in results[1:]] == ["static: no motions", "noise was not evaluated"]
     result = CliRunner().invoke(app, ["controls", str(tmp_path)])
     assert result.exit_code == 0
     assert "not measured" in result.output

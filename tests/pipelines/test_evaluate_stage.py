@@ -1,4 +1,4 @@
-"""Evaluation as a stage, as a command, and of a store that a script of ten lines wrote."""
+"""Evaluation as a stage, as a command, and of a store that a ten-line script wrote."""
 
 import json
 import re
@@ -38,16 +38,16 @@ def write_samples(clips, family="ours"):
     (folder / "diagnostics.json").write_text(json.dumps({"length": {"mae_frames": 3.5}}))
 
 
-def test_the_stage_writes_figures_and_what_the_family_says_of_itself(clips):
+def test_the_stage_writes_metrics_and_the_diagnostics_of_the_family(clips):
     write_samples(clips)
     evaluate.run(PATHS)
-    found = json.loads(METRICS.read_text())
-    assert found["figures"]["contact_f1"] == 1
-    assert found["held_out_clips"] == found["motions"] == 2
-    assert found["diagnostics"] == {"length": {"mae_frames": 3.5}}
+    evaluation = json.loads(METRICS.read_text())
+    assert evaluation["figures"]["contact_f1"] == 1
+    assert evaluation["held_out_clips"] == evaluation["motions"] == 2
+    assert evaluation["diagnostics"] == {"length": {"mae_frames": 3.5}}
 
 
-def test_lists_of_figures_are_computed_where_params_name_them(clips):
+def test_optional_metrics_are_computed_if_params_name_them(clips):
     write_samples(clips)
     Path("params.yaml").write_text(
         "{profile: embedded, datasets: [grab], families: [ours], evaluate: {metrics: [bimart]}}"
@@ -62,7 +62,7 @@ def test_lists_of_figures_are_computed_where_params_name_them(clips):
         evaluate.run(PATHS)
 
 
-def test_a_further_family_measures_that_family_alone_and_one_no_longer_listed_goes(clips, stage_folder, monkeypatch):
+def test_an_added_family_is_evaluated_alone_and_a_removed_one_is_deleted(clips, stage_folder, monkeypatch):
     write_samples(clips)
     evaluate.run(PATHS)
     before, measured = METRICS.read_bytes(), []
@@ -81,7 +81,7 @@ def test_a_further_family_measures_that_family_alone_and_one_no_longer_listed_go
 
 
 @pytest.mark.parametrize("changed", ["settings", "code", "data", "motions", "record"])
-def test_what_was_measured_is_measured_again_after_each_change_it_depends_on(clips, stage_folder, monkeypatch, changed):
+def test_metrics_are_recomputed_after_each_change_they_depend_on(clips, stage_folder, monkeypatch, changed):
     measured = []
     monkeypatch.setattr(evaluate, "_measured", lambda paths, settings: measured.append(paths.family) or {"empty": ""})
     write_samples(clips)
@@ -124,7 +124,7 @@ def test_a_subset_no_split_has_is_refused_and_not_empty(clips):
         load_annotated(PATHS.data).ids("dev")
 
 
-def test_the_reason_passes_through_where_there_are_no_motions(clips):
+def test_without_motions_the_reason_is_written(clips):
     write_empty(PATHS.samples, "not trained: length")
     evaluate.run(PATHS)
     assert json.loads(METRICS.read_text()) == {"empty": "not trained: length", "held_out_clips": 0}
@@ -137,7 +137,7 @@ def test_a_store_written_by_the_ten_line_script_of_the_docs_is_measured_by_the_c
     done = CliRunner().invoke(app, ["evaluate", "mine", "--reference", str(PATHS.data), "--out", "mine.json", *BIMART])
     assert done.exit_code == 0, done.output
     assert "joint error of the best sample" in done.output
-    found = json.loads(Path("mine.json").read_text())
-    assert found["figures"]["joint_error_mm"] == pytest.approx(10.0, abs=0.01)
-    assert found["motions"] == 4
-    assert found["figures"]["bimart_accel_paper"] > 0
+    evaluation = json.loads(Path("mine.json").read_text())
+    assert evaluation["figures"]["joint_error_mm"] == pytest.approx(10.0, abs=0.01)
+    assert evaluation["motions"] == 4
+    assert evaluation["figures"]["bimart_accel_paper"] > 0

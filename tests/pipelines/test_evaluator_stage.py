@@ -1,4 +1,4 @@
-"""The evaluator as a stage: off it costs nothing, on it stands in the figures of every family; killed trainings."""
+"""The evaluator stage: off, on with its metrics for every family, and killed trainings."""
 
 import json
 import multiprocessing
@@ -56,7 +56,7 @@ def test_off_it_writes_the_reason_without_loading_torch(project):
 
 
 @pytest.mark.slow
-def test_on_its_figures_and_digests_stand_in_the_metrics_of_a_family(project):
+def test_on_its_metrics_and_digests_are_in_the_metrics_of_a_family(project):
     plans = [("s1", "lift"), ("s1", "open"), ("s2", "lift"), ("s3", "lift"), ("s3", "open")]
     clips = [
         build_clip(20, seed=seed, clip_id=f"toy/{subject}/{seed}", subject=subject, verb=verb)
@@ -72,14 +72,16 @@ def test_on_its_figures_and_digests_stand_in_the_metrics_of_a_family(project):
     write_store(PATHS.samples / "clips", predicted, generated_info("ours"))
     (PATHS.samples / "diagnostics.json").write_text("{}")
     evaluate.run(PATHS)
-    found = json.loads((PATHS.metrics / "text2hoi.json").read_text())
+    evaluation = json.loads((PATHS.metrics / "text2hoi.json").read_text())
     info = json.loads((PATHS.evaluators / "info.json").read_text())
-    assert found["evaluators"].pop("path")
-    assert {name: known["digest"] for name, known in found["evaluators"].items()} == {
-        name: known["digest"] for name, known in info["evaluators"].items()
+    assert evaluation["evaluators"].pop("path")
+    assert {name: evaluator_info["digest"] for name, evaluator_info in evaluation["evaluators"].items()} == {
+        name: evaluator_info["digest"] for name, evaluator_info in info["evaluators"].items()
     }
-    assert found["figures"]["accuracy_top1_corrected"] == info["evaluators"]["corrected"]["accuracy"]["test"]["top1"]
-    assert found["notes"]["fid_frechet_corrected"] == "N too small"
+    assert (
+        evaluation["figures"]["accuracy_top1_corrected"] == info["evaluators"]["corrected"]["accuracy"]["test"]["top1"]
+    )
+    assert evaluation["notes"]["fid_frechet_corrected"] == "N too small"
 
 
 def end(*_: object, **__: object) -> None:
@@ -116,7 +118,7 @@ def killed(run: Callable[[StagePaths], None], paths: StagePaths) -> None:
     ],
     ids=["train", "evaluator"],
 )
-def test_a_killed_training_leaves_nothing_beside_its_output(
+def test_a_killed_training_leaves_no_other_files(
     stopped_project: Path,
     monkeypatch: pytest.MonkeyPatch,
     run: Callable[[StagePaths], None],

@@ -1,4 +1,4 @@
-"""Examples and notebooks run as they stand, in a project."""
+"""Examples and notebooks run unchanged in a project."""
 
 import json
 import runpy
@@ -19,9 +19,9 @@ NOTEBOOKS = sorted((PROJECT / "notebooks").glob("*.ipynb"))
 
 
 def test_examples_are_short_and_every_one_is_run():
-    found = {path.name: path.read_text().splitlines() for path in (PROJECT / "examples").glob("*.py")}
-    assert found.keys() == EXAMPLES.keys()
-    assert all(len(lines) <= 40 for lines in found.values())
+    lines_by_file = {path.name: path.read_text().splitlines() for path in (PROJECT / "examples").glob("*.py")}
+    assert lines_by_file.keys() == EXAMPLES.keys()
+    assert all(len(lines) <= 40 for lines in lines_by_file.values())
 
 
 @pytest.mark.slow
@@ -35,7 +35,7 @@ def test_an_example_runs(name, built, monkeypatch, capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs_and_is_kept_without_outputs(path, built, monkeypatch, capsys):
+def test_a_notebook_runs_and_is_stored_without_outputs(path, built, monkeypatch, capsys):
     matplotlib.use("agg")
     monkeypatch.chdir(built)
     names: dict = {}

@@ -1,4 +1,4 @@
-"""Stages side by side: in the order DVC's graph asks for, as many at once as said; what failures and signals cost."""
+"""Parallel stages: order of the DVC graph, number of jobs, failures and signals."""
 
 import signal
 import subprocess
@@ -35,12 +35,12 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
-# d needs b and c, which need a: b and c can run at once. e stands alone.
+# d needs b and c, which need a: b and c can run in parallel. e is independent.
 GRAPH = {"a": [], "b": ["a"], "c": ["a"], "d": ["b", "c"], "e": []}
 
 
 class Recorder:
-    """Runs nothing: notes when each stage begins and ends, and how many are at work at once."""
+    """Runs nothing; records when each stage begins and ends, and the number of parallel stages."""
 
     def __init__(self, failing: frozenset[str] = frozenset()) -> None:
         self.failing, self.events, self.at_work, self.most = failing, [], 0, 0
@@ -80,7 +80,7 @@ def graphs(draw):
 
 @settings(max_examples=40, deadline=None)
 @given(graphs(), st.integers(1, 4))
-def test_every_stage_runs_once_after_all_it_needs_and_no_more_at_once_than_said(upstream, jobs):
+def test_every_stage_runs_once_after_its_inputs_within_the_number_of_jobs(upstream, jobs):
     recorder = Recorder()
     run_graph(upstream, jobs, recorder)
     assert sorted(name for event, name in recorder.events if event == "begin") == sorted(upstream)
@@ -92,12 +92,12 @@ def test_every_stage_runs_once_after_all_it_needs_and_no_more_at_once_than_said(
 
 @settings(max_examples=40, deadline=None)
 @given(graphs(), st.data())
-def test_what_follows_from_a_failure_is_left_and_everything_else_is_done(upstream, data):
+def test_a_failure_stops_its_dependents_and_nothing_else(upstream, data):
     failing = data.draw(st.sampled_from(sorted(upstream)))
     recorder = Recorder(frozenset({failing}))
     run = run_graph(upstream, 2, recorder)
     lost = {failing}
-    for name, needs in upstream.items():  # they stand in an order that suits
+    for name, needs in upstream.items():  # in topological order
         if needs & lost:
             lost.add(name)
     assert set(run.seconds) == set(upstream) - lost | {failing, CODE}
@@ -117,7 +117,7 @@ if __name__ == "__main__":
 
 
 def tiny_project(folder: Path, sleep: float = 0.0) -> Path:
-    """A DVC project of GRAPH: each stage joins what it needs and its own source to one text."""
+    """A DVC project of GRAPH: each stage concatenates its inputs and its source file."""
     body = "import sys, time, pathlib; t = [pathlib.Path(p).read_text() for p in sys.argv[2:]]; "
     body += f"time.sleep({sleep}); pathlib.Path(sys.argv[1]).write_text('(' + ' '.join(t) + ')'); "
     body += "print('made', sys.argv[1])"
@@ -139,7 +139,7 @@ def tiny_project(folder: Path, sleep: float = 0.0) -> Path:
 
 
 @pytest.mark.slow
-def test_a_project_comes_up_to_date_as_by_dvc_repro_and_a_second_run_has_nothing_to_do(tmp_path):
+def test_a_run_equals_dvc_repro_and_a_second_run_does_nothing(tmp_path):
     tiny_project(tmp_path)
     run = reproduce_side_by_side([], jobs=2)
     assert sorted(run.seconds) == sorted([CODE, *GRAPH])
@@ -159,7 +159,7 @@ def test_a_project_comes_up_to_date_as_by_dvc_repro_and_a_second_run_has_nothing
 
 
 @pytest.mark.slow
-def test_a_failure_is_told_with_what_the_stage_said_and_outputs_that_were_there_stay(tmp_path, capfd):
+def test_a_failure_is_reported_with_its_output_and_existing_outputs_stay(tmp_path, capfd):
     tiny_project(tmp_path)
     reproduce_side_by_side([], jobs=2)
     (tmp_path / "b.src").write_bytes(b"\xff\xfe")
@@ -184,7 +184,7 @@ def test_a_stage_process_that_has_no_group_yet_or_has_ended_is_stopped_without_a
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
-def test_a_run_that_is_stopped_takes_its_stages_along_and_the_next_one_completes(tmp_path, sent):
+def test_stopping_a_run_stops_its_stages_and_the_next_run_completes(tmp_path, sent):
     tiny_project(tmp_path, sleep=20)
     (tmp_path / "start.py").write_text(START)
     process = subprocess.Popen([sys.executable, "start.py"], cwd=tmp_path, env={"PYTHONPATH": str(PROJECT)})
@@ -203,7 +203,7 @@ def test_a_run_that_is_stopped_takes_its_stages_along_and_the_next_one_completes
 
 @pytest.mark.slow
 @pytest.mark.parametrize("left", ["", '{"write": {"a.out": {"pid": 1,', "[]"])
-def test_half_a_lock_that_a_killed_process_left_stops_no_later_run(tmp_path, monkeypatch, left):
+def test_an_incomplete_lock_of_a_killed_process_does_not_stop_later_runs(tmp_path, monkeypatch, left):
     monkeypatch.chdir(tmp_path)
     tiny_project(tmp_path)
     RWLOCK.parent.mkdir(parents=True, exist_ok=True)
@@ -212,7 +212,7 @@ def test_half_a_lock_that_a_killed_process_left_stops_no_later_run(tmp_path, mon
     assert (tmp_path / "a.out").exists()
 
 
-def test_a_lock_that_is_whole_is_left_to_those_who_hold_it(tmp_path, monkeypatch):
+def test_a_complete_lock_stays(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     RWLOCK.parent.mkdir(parents=True)
     RWLOCK.write_text('{"write": {}, "read": {"a": [{"pid": 1, "cmd": "dvc"}]}}')

@@ -1,4 +1,4 @@
-"""Pairs of clips that differ in a known way, and an annotated dataset to evaluate stores against."""
+"""Pairs of clips with known differences, and an annotated dataset to evaluate stores against."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,7 +24,7 @@ def pair_of() -> Callable[..., Pair]:
 def build_pair(
     predicted: Clip, reference: Clip, hand_type: str = "right", threshold_m: float = 0.02, table_m: float | None = None
 ) -> Pair:
-    """A prediction beside its reference, as ``evaluate_store`` would make it. table_m: None leaves gravity out."""
+    """A prediction paired with its reference as in ``evaluate_store``; table_m None: without gravity."""
     hands = load_embedded_hands()
     motions = [
         Motion(clip, {side: track_joints(clip.hands[side], hands[side]) for side in SIDES}, hands)

@@ -1,4 +1,4 @@
-"""BimArt's figures on shapes and motions whose figure is known, and ``paper`` beside the released ones written anew."""
+"""BimArt's metrics on shapes and motions with known values; ``paper`` against an independent copy of the release."""
 
 import itertools
 from dataclasses import replace
@@ -13,10 +13,10 @@ from hoidata.clips.clip import FPS, ObjectTrack
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.metrics import bimart
-from hoidata.metrics.asked import DISTANCES_NAME, AskedDistances, read_asked_distances, write_asked_distances
-from hoidata.metrics.asked_metrics import ASKED_LISTS, BIMART_METRICS, with_lists
 from hoidata.metrics.evaluate import evaluate_store
+from hoidata.metrics.optional_metrics import BIMART_METRICS, OPTIONAL_LISTS, with_lists
 from hoidata.metrics.registry import METRICS
+from hoidata.metrics.target_contact import DISTANCES_NAME, AskedDistances, read_asked_distances, write_asked_distances
 from hoidata.objects.distance import is_closed
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.store.info import generated_info
@@ -36,8 +36,8 @@ def under_the_hand(model, depths_m, reach_m, **facts):
     away = replace(hand, wrist_m=hand.wrist_m + np.float32([0, 0, 9]))
     vertices = track_vertices(hand, load_embedded_hands().right)[0]
     lowest = vertices[vertices[:, 2].argmin()]
-    place = lowest - np.array([0, 0, 1]) * (reach_m - np.asarray(depths_m)[:, None])
-    track = ObjectTrack(model, np.zeros((n_frames, 3), np.float32), place.astype(np.float32), **facts)
+    position_m = lowest - np.array([0, 0, 1]) * (reach_m - np.asarray(depths_m)[:, None])
+    track = ObjectTrack(model, np.zeros((n_frames, 3), np.float32), position_m.astype(np.float32), **facts)
     return clip_of("toy/s1/a", track, {"left": away, "right": hand})
 
 
@@ -45,7 +45,7 @@ def ball():
     return model_of(trimesh.creation.icosphere(4, RADIUS_M), "ball")
 
 
-# --- known figures
+# --- known values
 
 
 def test_a_constant_acceleration_is_given_per_frame_and_per_second(make_clip, moved, pair_of):
@@ -54,12 +54,12 @@ def test_a_constant_acceleration_is_given_per_frame_and_per_second(make_clip, mo
     hand = replace(still.hands["right"], global_orient=np.tile(still.hands["right"].global_orient[:1], (9, 1)))
     path = np.zeros((9, 3))
     path[:, 0] = 0.5 * 3.0 * time**2
-    made = replace(clip, hands=clip.hands | {"right": replace(hand, wrist_m=path.astype(np.float32))})
-    pair = pair_of(made, clip)
+    accelerating = replace(clip, hands=clip.hands | {"right": replace(hand, wrist_m=path.astype(np.float32))})
+    pair = pair_of(accelerating, clip)
     assert bimart.accel_paper(pair, 1) == pytest.approx(np.full(7, 100 * 3.0 / 900), abs=1e-4)
     assert bimart.accel_corrected(pair, 1) == pytest.approx(np.full(7, 3.0), abs=1e-3)
     doubled = replace(clip, source_frames=(np.arange(9) // 2).astype(np.int32))
-    pair = pair_of(made, doubled)  # 15 fps: frames 0, 2, 4, 6 and 8 were recorded
+    pair = pair_of(accelerating, doubled)  # 15 fps: frames 0, 2, 4, 6 and 8 were recorded
     assert bimart.accel_paper(pair, 1) == pytest.approx(np.full(3, 100 * 3.0 / 225), abs=1e-4)
     assert bimart.accel_corrected(pair, 1) == pytest.approx(np.full(3, 3.0), abs=1e-3)
 
@@ -90,7 +90,7 @@ def test_a_sphere_at_known_depths_is_penetrated_and_touched_at_the_thresholds(pa
     assert bimart.con_everywhere_corrected(pair, 1).tolist() == [0, 100, 100, 100, 100, 0, 0, 0]
 
 
-def test_a_hinge_that_moves_asks_for_contact_with_the_part_that_moves(pair_of):
+def test_art_needs_contact_with_the_moving_part(pair_of):
     angle = np.float32([0, 0.01, 0.02, 0.0205, 0.04, 0.06])
     wide = notebook()
     wide = replace(wide, vertices_m=wide.vertices_m * [1, 5, 1])  # the hand lies over one plate alone
@@ -99,10 +99,10 @@ def test_a_hinge_that_moves_asks_for_contact_with_the_part_that_moves(pair_of):
         clip = under_the_hand(wide, np.full(6, 0.003), 0.005, hinge_rad=angle)
         vertices = track_vertices(clip.hands["right"], load_embedded_hands().right)[0]
         lowest = vertices[vertices[:, 2].argmin()]
-        place = clip.object.translation_m.copy()
-        place[:, 0] = lowest[0] - middle_x_m
-        own = replace(clip, object=replace(clip.object, translation_m=place))
-        pair = pair_of(own, own)
+        position_m = clip.object.translation_m.copy()
+        position_m[:, 0] = lowest[0] - middle_x_m
+        at_position = replace(clip, object=replace(clip.object, translation_m=position_m))
+        pair = pair_of(at_position, at_position)
         return bimart.art_paper(pair, 1).tolist(), bimart.art_corrected(pair, 1).tolist()
 
     still = np.zeros((6, 3), np.float32)
@@ -111,7 +111,7 @@ def test_a_hinge_that_moves_asks_for_contact_with_the_part_that_moves(pair_of):
     assert art(-0.95) == ([0] * 4, [0] * 4)
 
 
-def test_an_open_submesh_is_touched_where_it_is_and_has_no_inside_in_the_corrected(pair_of):
+def test_corrected_metrics_treat_an_open_submesh_as_surface_without_inside(pair_of):
     """A plate whose top has corners in both parts: all that lies wholly in the moving part is its far side."""
     mesh = trimesh.creation.box((0.1, 0.5, 0.02))
     model = notebook()
@@ -133,42 +133,43 @@ def cut_box(half_m):
     mesh.apply_translation((0.001, 0, 0))  # no vertex lies in the plane of the cut
     part = (mesh.vertices[:, 0] > 0).astype(np.uint8)
     hinge = Hinge(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, half_m[2]]))
-    model = ObjectModel("cut box", np.array(mesh.vertices), np.array(mesh.faces), part, hinge)
-    assert not any(is_closed(model.faces_of(own)) for own in (0, 1))
+    model = ObjectModel("cut box", np.array(mesh.vertices), np.array(mesh.faces), part=part, hinge=hinge)
+    assert not any(is_closed(model.faces_of(number)) for number in (0, 1))
     return model
 
 
 def placed(points_m, hinge_rad):
-    return PlacedHand(points_m[None], np.zeros(1, int), np.array([hinge_rad]), np.zeros((0, 3), int), 1)
+    faces = np.zeros((0, 3), int)
+    return PlacedHand(points_m[None], np.zeros(1, int), np.array([hinge_rad]), faces=faces, n_frames=1)
 
 
 def test_depth_as_released_takes_its_sign_from_the_whole_posed_mesh_though_each_part_is_open():
     model, random = cut_box((0.06, 0.05, 0.04)), np.random.default_rng(2)
     points = random.uniform(-0.08, 0.08, (400, 3))
-    found = bimart.whole_depth_m(placed(points, 0.0), model)[0]
+    depth_m = bimart.whole_depth_m(placed(points, 0.0), model)[0]
     outside_by = np.abs(points - [0.001, 0, 0]) - [0.06, 0.05, 0.04]
     inside = (outside_by < 0).all(axis=1)
     assert 20 < inside.sum() < 380
-    assert found[inside] == pytest.approx(-outside_by[inside].max(axis=1))  # to the nearest face of the box
-    assert found[inside].max() > 0.02  # beyond what thresholds ask for, and finite
-    assert (found[~inside] < 0).all()
+    assert depth_m[inside] == pytest.approx(-outside_by[inside].max(axis=1))  # to the nearest face of the box
+    assert depth_m[inside].max() > 0.02  # beyond all thresholds, and finite
+    assert (depth_m[~inside] < 0).all()
     for angle in (-0.3, 0.4):
-        found = bimart.whole_depth_m(placed(points, angle), model)[0]
+        depth_m = bimart.whole_depth_m(placed(points, angle), model)[0]
         posed = articulate(model.vertices_m, model.part, model.hinge, np.array([angle]))[0]
         expected = depth(points, posed, model.faces)
         near = expected > -0.02
-        assert found[near] == pytest.approx(expected[near], abs=1e-9)
-        assert (found[~near] <= -0.02).all()
+        assert depth_m[near] == pytest.approx(expected[near], abs=1e-9)
+        assert (depth_m[~near] <= -0.02).all()
 
 
-def test_what_two_parts_both_enclose_is_outside_as_released():
+def test_the_overlap_of_two_parts_is_outside_as_released():
     """Cubes of 4 cm, the second shifted by 3 cm along x: they share the slab from x = 1 cm to 2 cm."""
     cube, shifted = box_model((0.04, 0.04, 0.04)), box_model((0.04, 0.04, 0.04), middle_m=(0.03, 0, 0))
     model = two_parts(cube, shifted, (0, 0, 1))
     places = np.array([[0, 0.003, 0.001], [0.015, 0.003, 0.001], [0.044, 0.003, 0.001], [0.057, 0.003, 0.001]])
-    found = bimart.whole_depth_m(placed(places, 0.0), model)
+    depth_m = bimart.whole_depth_m(placed(places, 0.0), model)
     # 1 cm from the face at x = 1 cm; between the faces at 1 cm and 2 cm; 6 mm within, and 7 mm beyond x = 5 cm.
-    assert found[0] == pytest.approx([0.010, -0.005, 0.006, -0.007], abs=1e-9)
+    assert depth_m[0] == pytest.approx([0.010, -0.005, 0.006, -0.007], abs=1e-9)
 
 
 def test_an_object_without_hinge_has_no_art_and_one_at_rest_no_con(pair_of):
@@ -178,7 +179,7 @@ def test_an_object_without_hinge_has_no_art_and_one_at_rest_no_con(pair_of):
         assert len(measure(pair, 1)) == 0
 
 
-def test_shifted_hands_lose_contact_and_pressed_hands_keep_the_papers_alone(make_clip, moved, pair_of):
+def test_shifted_hands_lose_contact_and_pressed_hands_keep_only_that_of_the_paper(make_clip, moved, pair_of):
     clip = make_clip(12, "both", articulated=True)
     normal = Rotation.from_rotvec(clip.object.rotvec).apply([0, 0, 1.0])
 
@@ -193,9 +194,9 @@ def test_shifted_hands_lose_contact_and_pressed_hands_keep_the_papers_alone(make
 
 def shaken(model, steps_m, hinge_rad=None):
     """An object whose place along x changes by (frame - 1,) steps."""
-    place = np.zeros((len(steps_m) + 1, 3), np.float32)
-    place[1:, 0] = np.cumsum(steps_m)
-    return ObjectTrack(model, np.zeros_like(place), place, hinge_rad)
+    position_m = np.zeros((len(steps_m) + 1, 3), np.float32)
+    position_m[1:, 0] = np.cumsum(steps_m)
+    return ObjectTrack(model, np.zeros_like(position_m), position_m, hinge_rad)
 
 
 def test_a_still_object_with_the_noise_of_recordings_does_not_move_as_corrected_and_does_as_released():
@@ -214,7 +215,7 @@ def test_a_hinge_that_trembles_as_in_recordings_does_not_turn_and_one_that_turns
     assert bimart.moves(shaken(small, np.zeros(4), tremble)).tolist() == [False, False, False, True, False]
 
 
-# --- the released definitions, written anew: other distances, other rays, loops
+# --- an independent implementation of the released definitions: other distances, other rays, loops
 
 
 def released(vertices_m, track):
@@ -225,8 +226,8 @@ def released(vertices_m, track):
     for frame in range(n_frames):
         local = model.vertices_m.copy()
         moving = model.part == 1
-        turn = Rotation.from_rotvec(model.hinge.axis * float(track.hinge_rad[frame]))
-        local[moving] = turn.apply(local[moving] - model.hinge.origin_m) + model.hinge.origin_m
+        rotation = Rotation.from_rotvec(model.hinge.axis * float(track.hinge_rad[frame]))
+        local[moving] = rotation.apply(local[moving] - model.hinge.origin_m) + model.hinge.origin_m
         world = Rotation.from_rotvec(track.rotvec[frame]).apply(local) + track.translation_m[frame]
         places.append(world)
         whole[frame] = depth(vertices_m[frame], world, model.faces).max()
@@ -263,10 +264,10 @@ def depth(points, vertices, faces):
     return np.where(hits % 2 == 1, apart, -apart)
 
 
-def test_paper_is_what_the_release_gives_on_random_motions(pair_of, make_clip):
+def test_paper_equals_an_independent_implementation_on_random_motions(pair_of, make_clip):
     random, hands = np.random.default_rng(5), load_embedded_hands()
     names = {metric.name: metric.measure for metric in BIMART_METRICS}
-    seen = []
+    measured = []
     for seed in range(3):
         clip = make_clip(14, "both", articulated=True, seed=seed)
         overlapping = replace(clip.object.model, vertices_m=clip.object.model.vertices_m * [1, 1.1, 1])
@@ -277,26 +278,26 @@ def test_paper_is_what_the_release_gives_on_random_motions(pair_of, make_clip):
         track = replace(clip.object.take(frames), model=overlapping, hinge_rad=hinge)
         shift = random.normal(0, 0.02, (14, 3)).astype(np.float32)
         moved = {s: replace(hand, wrist_m=hand.wrist_m[frames] + shift) for s, hand in clip.hands.items()}
-        own = replace(clip, object=track, hands=moved)
-        pair = pair_of(own, own, "both")
-        vertices = np.concatenate([track_vertices(own.hands[s], hands[s]) for s in ("left", "right")], axis=1)
+        moving = replace(clip, object=track, hands=moved)
+        pair = pair_of(moving, moving, "both")
+        vertices = np.concatenate([track_vertices(moving.hands[s], hands[s]) for s in ("left", "right")], axis=1)
         expected = released(vertices.astype(np.float64), track)
         two = np.stack([vertices[:, 0], vertices[:, 9]], axis=1)
-        every = np.linalg.norm(np.diff(vertices.astype(np.float64), n=2, axis=0), axis=2)
+        second_differences = np.linalg.norm(np.diff(vertices.astype(np.float64), n=2, axis=0), axis=2)
         assert 100 * np.linalg.norm(np.diff(two, n=2, axis=0), axis=2).mean() == pytest.approx(
             expected.pop("accel of two")
         )
-        assert names["bimart_accel_paper"](pair, 1).mean() == pytest.approx(100 * every.mean())
+        assert names["bimart_accel_paper"](pair, 1).mean() == pytest.approx(100 * second_differences.mean())
         assert {name: names[name](pair, 1).mean() for name in expected} == pytest.approx(expected)
-        seen.append(list(expected.values()))
-    assert (np.ptp(seen, axis=0) > 0).any()
-    assert 0 < np.mean(seen) < 100
+        measured.append(list(expected.values()))
+    assert (np.ptp(measured, axis=0) > 0).any()
+    assert 0 < np.mean(measured) < 100
 
 
 # --- contact maps
 
 
-def asked_of(clip, off_m=0.0, hand_vertices=None):
+def target_of(clip, off_m=0.0, hand_vertices=None):
     """The map that the clip's hands make at ten vertices of its box, off by so much."""
     used = np.arange(778) if hand_vertices is None else hand_vertices
     hands, model = load_embedded_hands(), clip.object.model
@@ -316,31 +317,31 @@ def asked_of(clip, off_m=0.0, hand_vertices=None):
     return AskedDistances(places, distance + off_m, used.astype(np.int32))
 
 
-def test_cm_is_the_distance_of_the_map_made_from_the_one_asked_for(make_clip, pair_of):
+def test_cm_is_the_distance_between_the_generated_and_the_target_map(make_clip, pair_of):
     clip = make_clip(6, "both", articulated=True)
-    pair = replace(pair_of(clip, clip, "both"), asked_distances=asked_of(clip, 0.01))
+    pair = replace(pair_of(clip, clip, "both"), target_distances=target_of(clip, 0.01))
     assert bimart.cm_paper(pair, 1) == pytest.approx(np.ones(12), abs=1e-4)
-    few = asked_of(clip, hand_vertices=np.arange(0, 778, 10))
-    pair = replace(pair, asked_distances=few)
+    few = target_of(clip, hand_vertices=np.arange(0, 778, 10))
+    pair = replace(pair, target_distances=few)
     assert bimart.cm_corrected(pair, 1) == pytest.approx(np.zeros(12), abs=1e-4)
     assert (bimart.cm_paper(pair, 1) > 0.01).all()  # a map of few vertices is farther than one of all
     nothing = few._replace(distance_m=np.full_like(few.distance_m, np.nan))
-    assert len(bimart.cm_paper(replace(pair, asked_distances=nothing), 1)) == 0
+    assert len(bimart.cm_paper(replace(pair, target_distances=nothing), 1)) == 0
     assert len(bimart.cm_paper(pair_of(clip, clip, "both"), 1)) == 0
     far = few._replace(distance_m=np.full_like(few.distance_m, 5.0))
-    assert bimart.cm_corrected(replace(pair, asked_distances=far), 1).max() < 20
+    assert bimart.cm_corrected(replace(pair, target_distances=far), 1).max() < 20
 
 
-def test_maps_of_distances_come_back_from_the_file_to_a_tenth_of_a_millimetre(make_clip, tmp_path):
-    asked = {"a~0": asked_of(make_clip(4)), "b~0": asked_of(make_clip(7)), "a~1": asked_of(make_clip(4), 0.01)}
+def test_target_distances_survive_the_file_to_a_tenth_of_a_millimetre(make_clip, tmp_path):
+    targets = {"a~0": target_of(make_clip(4)), "b~0": target_of(make_clip(7)), "a~1": target_of(make_clip(4), 0.01)}
     assert read_asked_distances(tmp_path / "clips") == {}
-    write_asked_distances(tmp_path, asked)
+    write_asked_distances(tmp_path, targets)
     back = read_asked_distances(tmp_path / "clips")
-    assert list(back) == list(asked)
-    for name, own in asked.items():
-        assert np.abs(back[name].place_m - own.place_m).max() < 1.5e-4
-        near = own.distance_m < 0.2
-        assert np.abs(back[name].distance_m - own.distance_m)[near].max() < 1e-4
+    assert list(back) == list(targets)
+    for name, target in targets.items():
+        assert np.abs(back[name].place_m - target.place_m).max() < 1.5e-4
+        near = target.distance_m < 0.2
+        assert np.abs(back[name].distance_m - target.distance_m)[near].max() < 1e-4
     wrong = np.load(tmp_path / DISTANCES_NAME)
     arrays = {name: wrong[name] for name in wrong.files}
     assert len(arrays["place_m"]) == 11  # motions for one path share them
@@ -350,35 +351,36 @@ def test_maps_of_distances_come_back_from_the_file_to_a_tenth_of_a_millimetre(ma
             read_asked_distances(tmp_path / "clips")
 
 
-# --- asked for
+# --- computed on request
 
 
-def test_the_list_costs_nothing_until_it_is_asked_for(write_annotated, moved, tmp_path):
+def test_optional_metrics_are_computed_only_on_request(write_annotated, moved, tmp_path):
     root, clips = write_annotated()
     predicted = [
         replace(moved(c, (0, 0.01 * k, 0)), clip_id=f"{c.clip_id}~{k}") for c in clips.values() for k in (0, 1)
     ]
     write_store(tmp_path / "two" / "clips", predicted, generated_info("predicted"))
-    write_asked_distances(tmp_path / "two", {clip.clip_id: asked_of(clip) for clip in predicted})
-    own = {metric.name for metric in BIMART_METRICS}
+    write_asked_distances(tmp_path / "two", {clip.clip_id: target_of(clip) for clip in predicted})
+    bimart_names = {metric.name for metric in BIMART_METRICS}
     plain = evaluate_store(tmp_path / "two" / "clips", root)
-    assert not own & set(plain["figures"])
-    found = evaluate_store(tmp_path / "two" / "clips", root, metrics=with_lists(["bimart"]))
-    assert {name: value for name, value in found["figures"].items() if name not in own} == plain["figures"]
-    assert found["figures"]["bimart_mul_cm"] == pytest.approx(1, abs=1e-4)
-    assert found["counts"]["bimart_mul_cm"] == {"clips": 2, "motions": 2, "values": 2}
-    assert found["counts"]["bimart_con_paper"] == {"clips": 2, "motions": 2, "values": 22}
-    assert found["figures"]["bimart_cm_paper"] == pytest.approx(0, abs=0.01)
-    rigid = {name for name in own if "_art_" in name}
-    assert own - set(found["figures"]) == rigid
+    assert not bimart_names & set(plain["figures"])
+    evaluation = evaluate_store(tmp_path / "two" / "clips", root, metrics=with_lists(["bimart"]))
+    values, counts = evaluation["figures"], evaluation["counts"]
+    assert {name: value for name, value in values.items() if name not in bimart_names} == plain["figures"]
+    assert values["bimart_mul_cm"] == pytest.approx(1, abs=1e-4)
+    assert counts["bimart_mul_cm"] == {"clips": 2, "motions": 2, "values": 2}
+    assert counts["bimart_con_paper"] == {"clips": 2, "motions": 2, "values": 22}
+    assert values["bimart_cm_paper"] == pytest.approx(0, abs=0.01)
+    needs_hinge = {name for name in bimart_names if "_art_" in name}
+    assert bimart_names - set(values) == needs_hinge
     with pytest.raises(BadInput, match="bimart"):
         with_lists(["bimart", "omomo"])
-    short = AskedDistances(*(array[:5] for array in asked_of(predicted[1])))
+    short = AskedDistances(*(array[:5] for array in target_of(predicted[1])))
     write_asked_distances(tmp_path / "two", {predicted[1].clip_id: short})
     reasons = {item["clip_id"]: item["reason"] for item in evaluate_store(tmp_path / "two" / "clips", root)["left_out"]}
     assert "5 frames, not 12" in reasons[predicted[1].clip_id]
 
 
 def test_names_and_titles_of_all_lists_are_different():
-    rows = [*METRICS, *(row for rows in ASKED_LISTS.values() for row in rows)]
-    assert len({row.name for row in rows}) == len({row.title for row in rows}) == len(rows)
+    metrics = [*METRICS, *(metric for optional in OPTIONAL_LISTS.values() for metric in optional)]
+    assert len({metric.name for metric in metrics}) == len({metric.title for metric in metrics}) == len(metrics)

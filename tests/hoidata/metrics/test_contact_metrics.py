@@ -1,4 +1,4 @@
-"""Precision, recall, adherence, slip, shared volume and hands in each other, of motions whose figures are known."""
+"""Precision, recall, adherence, slip, intersection volume and hand-hand penetration on motions with known values."""
 
 from dataclasses import replace
 
@@ -30,20 +30,20 @@ def with_true(pair, touched):
 # --- maps
 
 
-def test_precision_is_of_what_is_made_and_recall_of_what_is_true(make_clip, pair_of):
+def test_precision_divides_by_generated_and_recall_by_reference_contact(make_clip, pair_of):
     clip = make_clip(6)
     pair = pair_of(clip, clip)
-    made = touch.touched_points(pair)
-    count, half = int(made.sum()), int(made.sum()) // 2
-    true = made.copy()
-    true[np.flatnonzero(made)[:half]] = False
-    true[np.flatnonzero(~made)[: 2 * count]] = True
+    touched = touch.touched_points(pair)
+    count, half = int(touched.sum()), int(touched.sum()) // 2
+    true = touched.copy()
+    true[np.flatnonzero(touched)[:half]] = False
+    true[np.flatnonzero(~touched)[: 2 * count]] = True
     pair = with_true(pair, true)
     assert touch.contact_precision(pair, 1) == pytest.approx([(count - half) / count])
     assert touch.contact_recall(pair, 1) == pytest.approx([(count - half) / (3 * count - half)])
 
 
-def test_a_map_that_is_empty_on_one_side_has_nothing_right_and_two_empty_ones_agree(make_clip, moved, pair_of):
+def test_one_empty_map_scores_zero_and_two_empty_maps_score_one(make_clip, moved, pair_of):
     clip = make_clip(6)
     pair = pair_of(moved(clip, (0.0, 0.0, 1.0)), clip)
     for measure in (touch.contact_f1, touch.contact_precision, touch.contact_recall):
@@ -52,17 +52,19 @@ def test_a_map_that_is_empty_on_one_side_has_nothing_right_and_two_empty_ones_ag
         assert measure(with_true(pair_of(clip, clip), np.zeros(256, bool)), 1) == [0.0]
 
 
-def test_adherence_is_to_the_map_asked_for_and_not_to_the_true_one(make_clip, pair_of):
+def test_adherence_compares_with_the_target_map_and_not_with_the_recorded_one(make_clip, pair_of):
     clip = make_clip(6)
     pair = pair_of(clip, clip)
-    made = touch.touched_points(pair)
-    asked = made.copy()
-    asked[np.flatnonzero(made)[::2]] = False
-    kept = int(asked.sum())
-    assert touch.adherence(replace(pair, asked=made), 1) == [1.0]
-    assert touch.adherence(replace(pair, asked=asked), 1) == pytest.approx([2 * kept / (kept + made.sum())])
-    assert touch.adherence(with_true(replace(pair, asked=~made), made), 1) == [0.0]
-    assert touch.adherence(with_true(replace(pair, asked=made), ~made), 1) == [1.0]
+    touched = touch.touched_points(pair)
+    target = touched.copy()
+    target[np.flatnonzero(touched)[::2]] = False
+    n_target = int(target.sum())
+    assert touch.adherence(replace(pair, target_contact=touched), 1) == [1.0]
+    assert touch.adherence(replace(pair, target_contact=target), 1) == pytest.approx(
+        [2 * n_target / (n_target + touched.sum())]
+    )
+    assert touch.adherence(with_true(replace(pair, target_contact=~touched), touched), 1) == [0.0]
+    assert touch.adherence(with_true(replace(pair, target_contact=touched), ~touched), 1) == [1.0]
     assert len(touch.adherence(pair, 1)) == 0
 
 
@@ -70,7 +72,7 @@ def test_adherence_is_to_the_map_asked_for_and_not_to_the_true_one(make_clip, pa
 
 
 def gliding(make_clip, pair_of, joints_of, track):
-    """A pair whose right joints (frame, 21, 3) are given in the world, on an object that moves as told."""
+    """A pair with the given world joints (frame, 21, 3) of the right hand and the given object motion."""
     clip = replace(make_clip(track.n_frames), object=track)
     joints = np.asarray(joints_of, np.float64)
     pair = pair_of(clip, clip)
@@ -90,8 +92,8 @@ def test_slip_is_the_speed_of_touching_joints_over_an_object_that_moves(make_cli
     still = np.zeros((12, 3), np.float32)
     moving = ObjectTrack(box_model(), still, path)
     glides = joints + path[:, None] + (0.03 * time)[:, None, None] * [0, 1, 0]
-    found = touch.slip_cm_s(gliding(make_clip, pair_of, glides, moving), 1)
-    assert found == pytest.approx(np.full(5 * 11, 3.0), abs=1e-3)
+    values = touch.slip_cm_s(gliding(make_clip, pair_of, glides, moving), 1)
+    assert values == pytest.approx(np.full(5 * 11, 3.0), abs=1e-3)
     assert touch.slip_cm_s(gliding(make_clip, pair_of, joints + path[:, None], moving), 1).max() < 1e-3
     lying = ObjectTrack(box_model(), still, still)
     assert len(touch.slip_cm_s(gliding(make_clip, pair_of, glides, lying), 1)) == 0
@@ -102,14 +104,14 @@ def test_a_hand_that_turns_with_the_object_or_goes_with_its_lid_does_not_slip(ma
     still = np.zeros((12, 3), np.float32)
     turning = ObjectTrack(box_model(), np.float32(2 * time[:, None] * [0, 0, 1]), still)
     on_top = everywhere((0.04, 0.03, 0.031))
-    found = touch.slip_cm_s(gliding(make_clip, pair_of, turning.world_from_object @ on_top, turning), 1)
-    assert len(found) == 21 * 11
-    assert found.max() < 1e-3
+    values = touch.slip_cm_s(gliding(make_clip, pair_of, turning.world_from_object @ on_top, turning), 1)
+    assert len(values) == 21 * 11
+    assert values.max() < 1e-3
     opening = ObjectTrack(notebook(), still, still, np.float32(2 * time))
     on_lid = notebook().hinge.turn(opening.hinge_rad) @ everywhere((0.08, 0, 0.006))
-    found = touch.slip_cm_s(gliding(make_clip, pair_of, on_lid, opening), 1)
-    assert len(found) == 21 * 11
-    assert found.max() < 1e-2
+    values = touch.slip_cm_s(gliding(make_clip, pair_of, on_lid, opening), 1)
+    assert len(values) == 21 * 11
+    assert values.max() < 1e-2
     slips = touch.slip_cm_s(gliding(make_clip, pair_of, everywhere((0.08, 0, 0.006)), opening), 1)
     assert slips[:21] == pytest.approx(np.full(21, 100 * 2 * np.hypot(0.08, 0.006)), rel=0.01)
 
@@ -120,28 +122,30 @@ def test_a_hand_that_turns_with_the_object_or_goes_with_its_lid_does_not_slip(ma
 def in_the_palm(clip, model):
     """The object, still, where the right palm is in the first frame; the clip's hand holds still too."""
     hand = clip.hands["right"].take(np.zeros(clip.n_frames, int))
-    own = hand_capsules(hand, HANDS.right)
-    middle = np.float32((own.start_m[0, 1] + own.end_m[0, 1]) / 2)
+    capsules_of_hand = hand_capsules(hand, HANDS.right)
+    middle = np.float32((capsules_of_hand.start_m[0, 1] + capsules_of_hand.end_m[0, 1]) / 2)
     still = np.zeros((clip.n_frames, 3), np.float32)
     return replace(with_hand(clip, "right", **vars(hand)), object=ObjectTrack(model, still, still + middle))
 
 
 @pytest.mark.slow
-def test_a_ball_in_the_palm_shares_its_own_volume_with_the_hand_and_a_block_around_it_the_hand_s(make_clip, pair_of):
+def test_the_intersection_volume_of_an_enclosed_ball_is_its_own_and_of_an_enclosing_block_the_hand_s(
+    make_clip, pair_of
+):
     clip = make_clip(7)
-    held = in_the_palm(clip, model_of(trimesh.creation.icosphere(4, 0.006)))
-    found = touch.penetration_volume_cm3(pair_of(held, held), 3)
-    assert found == pytest.approx(np.full(3, 4 / 3 * np.pi * 0.6**3), rel=0.05)
+    in_hand = in_the_palm(clip, model_of(trimesh.creation.icosphere(4, 0.006)))
+    values = touch.penetration_volume_cm3(pair_of(in_hand, in_hand), 3)
+    assert values == pytest.approx(np.full(3, 4 / 3 * np.pi * 0.6**3), rel=0.05)
     buried = in_the_palm(clip, box_model((0.6, 0.6, 0.6)))
     closed = patched_holes(track_vertices(buried.hands["right"], HANDS.right)[0].astype(float), HANDS.right.faces)
     assert touch.penetration_volume_cm3(pair_of(buried, buried), 3) == pytest.approx(
         np.full(3, 1e6 * volume_m3(*closed)), rel=0.01
     )
-    far = with_object(held, translation_m=held.object.translation_m + np.float32(1))
+    far = with_object(in_hand, translation_m=in_hand.object.translation_m + np.float32(1))
     assert touch.penetration_volume_cm3(pair_of(far, far), 3).tolist() == [0.0] * 3
 
 
-def test_an_object_without_an_inside_shares_no_volume_that_could_be_told(make_clip, pair_of):
+def test_intersection_volume_is_unmeasured_for_an_object_that_is_not_solid(make_clip, pair_of):
     clip = make_clip(6)
     sheet = replace(clip.object.model, faces=clip.object.model.faces[:1], name="one triangle")
     clip = with_object(clip, model=sheet)
@@ -168,7 +172,7 @@ def capsules(start, end, radius) -> Capsules:
     [
         ((-1, 0.3, 0.5), (1, 0.3, 0.5), 0.2),  # crosses at a distance of 0.3
         ((0, 0.2, 0), (0, 1.2, 0), 0.3),  # begins 0.2 above the middle
-        ((0, 0.1, -5), (0, 0.1, 5), 0.4),  # runs beside it
+        ((0, 0.1, -5), (0, 0.1, 5), 0.4),  # parallel to it
         ((0, 0, 1.4), (0, 0, 3), 0.1),  # goes on where it ends
         ((0, 0.2, 0.5), (0, 0.2, 0.5), 0.3),  # a ball
         ((3, 0, 0), (4, 0, 0), 0.0),
@@ -184,13 +188,13 @@ def test_axes_of_any_direction_are_as_far_apart_as_a_search_finds():
     draw = np.random.default_rng(3)
     for _ in range(20):
         a, b, c, d = draw.normal(size=(4, 3))
-        found = 9 - touch.depth_m(capsules([a], [b], [4]), capsules([c], [d], [5]))
+        values = 9 - touch.depth_m(capsules([a], [b], [4]), capsules([c], [d], [5]))
         along = lsq_linear(np.stack([b - a, c - d], axis=1), c - a, bounds=(0, 1)).x
         far = np.linalg.norm(a + along[0] * (b - a) - c - along[1] * (d - c))
-        assert found == pytest.approx([far], abs=1e-6)
+        assert values == pytest.approx([far], abs=1e-6)
 
 
-def test_hands_are_measured_against_each_other_where_both_act(make_clip, moved, pair_of):
+def test_hand_hand_penetration_is_measured_if_both_hands_act(make_clip, moved, pair_of):
     clip = make_clip(9, "both")
     apart = moved(clip, (0, 0, 0.5), ["left"])
     between = clip.hands["right"].wrist_m - clip.hands["left"].wrist_m
@@ -218,7 +222,7 @@ def test_jitter_of_a_sine_is_its_third_derivative(make_clip, pair_of):
     assert factor == pytest.approx(amplitude_m * (2 * np.pi * hertz) ** 3, rel=0.05)
 
 
-def test_controls_lose_what_they_must_lose(write_annotated, moved, tmp_path):
+def test_negative_controls_lower_the_expected_metrics(write_annotated, moved, tmp_path):
     """Hands 2 cm away, hands pressed in, hands that tremble, against the recorded clips themselves."""
     root, clips = write_annotated()
     draw = np.random.default_rng(0)
@@ -234,14 +238,14 @@ def test_controls_lose_what_they_must_lose(write_annotated, moved, tmp_path):
         return lambda clip: moved(clip, clip.object.world_from_object.turn(np.array([[0, 0, metres]]))[:, 0])
 
     changes = {"truth": lambda clip: clip, "away": off_the_face(0.02), "pressed": off_the_face(-0.01)}
-    found = {}
+    values = {}
     for name, change in (changes | {"trembling": trembling}).items():
         write_store(tmp_path / name, map(change, clips.values()), generated_info(name))
-        found[name] = evaluate_store(tmp_path / name, root)["figures"]
-    truth = found["truth"]
-    assert found["away"]["contact_f1"] < 0.8 * truth["contact_f1"]
-    assert found["away"]["contact_recall"] < 0.8
-    assert found["pressed"]["penetration_mm"] > truth["penetration_mm"] + 5
-    assert found["pressed"]["penetration_volume_cm3"] > truth["penetration_volume_cm3"] + 0.5
-    assert found["trembling"]["jitter_m_s3"] > 3 * truth["jitter_m_s3"]
-    assert found["trembling"]["slip_cm_s"] > 3 * truth["slip_cm_s"] + 1
+        values[name] = evaluate_store(tmp_path / name, root)["figures"]
+    truth = values["truth"]
+    assert values["away"]["contact_f1"] < 0.8 * truth["contact_f1"]
+    assert values["away"]["contact_recall"] < 0.8
+    assert values["pressed"]["penetration_mm"] > truth["penetration_mm"] + 5
+    assert values["pressed"]["penetration_volume_cm3"] > truth["penetration_volume_cm3"] + 0.5
+    assert values["trembling"]["jitter_m_s3"] > 3 * truth["jitter_m_s3"]
+    assert values["trembling"]["slip_cm_s"] > 3 * truth["slip_cm_s"] + 1

@@ -1,8 +1,9 @@
-"""Stores against annotated datasets: which clips are compared, how values become figures, what is left out."""
+"""Evaluation of stores: which clips are compared, how values are reduced to results, which clips are skipped."""
 
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,11 +11,11 @@ import pytest
 from hoidata.errors import BadInput
 from hoidata.files.arrays import write_npz
 from hoidata.metrics import registry
-from hoidata.metrics.asked import FILE_NAME, write_asked
-from hoidata.metrics.asked_metrics import with_lists
 from hoidata.metrics.describe import readme
-from hoidata.metrics.evaluate import Measured, Sample, evaluate_store, intervals_of, matched
-from hoidata.metrics.registry import METRICS, is_better, metric, reduced
+from hoidata.metrics.evaluate import ClipResult, Sample, evaluate_store, intervals_of, match_predictions
+from hoidata.metrics.optional_metrics import with_lists
+from hoidata.metrics.registry import METRICS, is_better, metric, summarise
+from hoidata.metrics.target_contact import FILE_NAME, write_asked
 from hoidata.store.annotated import load_annotated
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
@@ -32,15 +33,15 @@ def named(clip, clip_id, **changes):
     return replace(clip, clip_id=clip_id, **changes)
 
 
-def test_the_truth_has_no_error_and_all_its_contacts(write_annotated, tmp_path):
+def test_recorded_clips_have_no_error_and_full_contact(write_annotated, tmp_path):
     root, clips = write_annotated()
-    found = evaluate_store(written(tmp_path / "same", clips.values()), root)
-    assert (found["held_out_clips"], found["motions"], found["left_out"]) == (2, 2, [])
-    assert found["figures"]["joint_error_mm"] == 0
-    assert found["figures"]["contact_f1"] == 1
-    assert set(found["counts"]) == set(found["figures"])
-    assert found["counts"]["joint_error_mm"] == {"clips": 2, "motions": 2, "values": 3 * 12}
-    assert set(found["figures"]) <= {item.name for item in METRICS}
+    evaluation = evaluate_store(written(tmp_path / "same", clips.values()), root)
+    assert (evaluation["held_out_clips"], evaluation["motions"], evaluation["left_out"]) == (2, 2, [])
+    assert evaluation["figures"]["joint_error_mm"] == 0
+    assert evaluation["figures"]["contact_f1"] == 1
+    assert set(evaluation["counts"]) == set(evaluation["figures"])
+    assert evaluation["counts"]["joint_error_mm"] == {"clips": 2, "motions": 2, "values": 3 * 12}
+    assert set(evaluation["figures"]) <= {item.name for item in METRICS}
 
 
 def test_the_best_sample_of_each_clip_counts_for_joints_and_the_first_two_for_meshes(write_annotated, moved, tmp_path):
@@ -48,34 +49,34 @@ def test_the_best_sample_of_each_clip_counts_for_joints_and_the_first_two_for_me
     shifts = {RIGHT: (0.02, 0.03, 0.004), BOTH: (0.008, 0.05, 0.06)}
     predicted = [
         named(moved(clips[clip_id], (shift, 0, 0)), f"{clip_id}~{number}")
-        for clip_id, row in shifts.items()
-        for number, shift in enumerate(row)
+        for clip_id, values_of_clip in shifts.items()
+        for number, shift in enumerate(values_of_clip)
     ]
-    found = evaluate_store(written(tmp_path / "three", predicted[::-1]), root)
-    assert found["figures"]["joint_error_mm"] == pytest.approx((4 + 8) / 2, abs=1e-3)
-    assert found["motions"] == 6
-    assert found["counts"]["penetration_mm"]["motions"] == 4
+    evaluation = evaluate_store(written(tmp_path / "three", predicted[::-1]), root)
+    assert evaluation["figures"]["joint_error_mm"] == pytest.approx((4 + 8) / 2, abs=1e-3)
+    assert evaluation["motions"] == 6
+    assert evaluation["counts"]["penetration_mm"]["motions"] == 4
     two = evaluate_store(written(tmp_path / "two", [p for p in predicted if not p.clip_id.endswith("~2")]), root)
     for name in ("penetration_mm", "contact_distance_mm"):
-        assert found["figures"][name] == two["figures"][name]
+        assert evaluation["figures"][name] == two["figures"][name]
 
 
 def test_a_motion_under_another_clips_name_is_measured_against_that_clip(write_annotated, tmp_path):
     root, clips = write_annotated()
     swapped = [named(clips[RIGHT], f"{BOTH}~0"), named(clips[BOTH], f"{RIGHT}~0")]
-    found = evaluate_store(written(tmp_path / "swapped", swapped), root)
-    assert found["figures"]["joint_error_mm"] > 50
-    assert found["figures"]["contact_f1"] < 0.7
+    evaluation = evaluate_store(written(tmp_path / "swapped", swapped), root)
+    assert evaluation["figures"]["joint_error_mm"] > 50
+    assert evaluation["figures"]["contact_f1"] < 0.7
 
 
-def test_left_and_right_hand_are_not_taken_for_each_other(write_annotated, moved, tmp_path):
+def test_left_and_right_hand_are_not_confused(write_annotated, moved, tmp_path):
     root, clips = write_annotated()
     predicted = moved(clips[RIGHT], (0, 0, 0.02), ["right"])
-    found = evaluate_store(written(tmp_path / "right", [predicted]), root)
-    assert found["figures"]["joint_error_mm"] == pytest.approx(20, abs=1e-3)
+    evaluation = evaluate_store(written(tmp_path / "right", [predicted]), root)
+    assert evaluation["figures"]["joint_error_mm"] == pytest.approx(20, abs=1e-3)
     predicted = moved(clips[RIGHT], (0, 0, 0.02), ["left"])
-    found = evaluate_store(written(tmp_path / "left", [predicted]), root)
-    assert found["figures"]["joint_error_mm"] == 0
+    evaluation = evaluate_store(written(tmp_path / "left", [predicted]), root)
+    assert evaluation["figures"]["joint_error_mm"] == 0
 
 
 def test_predictions_that_cannot_be_compared_are_listed_with_the_reason(write_annotated, make_clip, tmp_path):
@@ -92,39 +93,39 @@ def test_predictions_that_cannot_be_compared_are_listed_with_the_reason(write_an
         named(clip, "toy/s1/0~0"),
         named(clip, f"{RIGHT}~x"),
     ]
-    found = evaluate_store(written(tmp_path / "odd", predicted), root)
-    reasons = {item["clip_id"]: item["reason"] for item in found["left_out"]}
+    evaluation = evaluate_store(written(tmp_path / "odd", predicted), root)
+    reasons = {item["clip_id"]: item["reason"] for item in evaluation["left_out"]}
     assert set(reasons) == {item.clip_id for item in predicted[1:]}
     assert reasons[f"{RIGHT}~1"].startswith("9 frames, 12 expected")
     assert "left hand" in reasons[f"{BOTH}~0"]
     assert "mesh" in reasons[f"{BOTH}~1"]
-    assert found["motions"] == 1
+    assert evaluation["motions"] == 1
 
 
 def test_a_clip_without_prediction_is_listed(write_annotated, tmp_path):
     root, clips = write_annotated()
-    found = evaluate_store(written(tmp_path / "one", [clips[RIGHT]]), root)
-    assert found["left_out"] == [{"clip_id": BOTH, "reason": "no prediction of this clip"}]
-    assert found["held_out_clips"] == 2
+    evaluation = evaluate_store(written(tmp_path / "one", [clips[RIGHT]]), root)
+    assert evaluation["left_out"] == [{"clip_id": BOTH, "reason": "no prediction of this clip"}]
+    assert evaluation["held_out_clips"] == 2
 
 
-def test_a_store_of_which_nothing_can_be_compared_is_refused(write_annotated, make_clip, tmp_path):
+def test_a_store_without_comparable_clips_is_refused(write_annotated, make_clip, tmp_path):
     root, _ = write_annotated()
     with pytest.raises(BadInput, match=r"<id>~<k>.*unknown"):
         evaluate_store(written(tmp_path / "none", [make_clip(12, clip_id="toy/s9/unknown")]), root)
 
 
 @pytest.mark.parametrize("start", [0, 4])
-def test_a_prediction_of_some_frames_is_compared_with_those(write_annotated, tmp_path, start):
+def test_a_prediction_of_part_of_the_frames_is_compared_with_that_part(write_annotated, tmp_path, start):
     root, clips = write_annotated()
     part = clips[RIGHT].take(slice(start, start + 7))
-    found = evaluate_store(written(tmp_path / "part", [part]), root)
-    assert found["figures"]["joint_error_mm"] == 0
-    assert found["figures"]["contact_f1"] == 1
-    assert found["counts"]["joint_error_mm"]["values"] == 7
+    evaluation = evaluate_store(written(tmp_path / "part", [part]), root)
+    assert evaluation["figures"]["joint_error_mm"] == 0
+    assert evaluation["figures"]["contact_f1"] == 1
+    assert evaluation["counts"]["joint_error_mm"]["values"] == 7
 
 
-def test_the_threshold_and_points_are_those_of_the_contact_stage(write_annotated, tmp_path):
+def test_evaluation_uses_threshold_and_points_of_the_contact_stage(write_annotated, tmp_path):
     def of(folder, **settings):
         root, clips = write_annotated(**settings)
         root = root.rename(tmp_path / folder)
@@ -132,75 +133,79 @@ def test_the_threshold_and_points_are_those_of_the_contact_stage(write_annotated
 
     wide, narrow = of("wide"), of("narrow", threshold_m=0.012, points=100)
     assert narrow["figures"]["contact_f1"] == 1
-    counts = [found["counts"]["contact_distance_mm"]["values"] for found in (narrow, wide)]
+    counts = [evaluation["counts"]["contact_distance_mm"]["values"] for evaluation in (narrow, wide)]
     assert 0 < counts[0] < counts[1]
 
 
-def test_sample_k_of_all_clips_is_repetition_k_and_its_figures_give_the_interval(write_annotated, moved, tmp_path):
+def test_intervals_over_repetitions_use_sample_k_of_all_clips_as_repetition_k(write_annotated, moved, tmp_path):
     root, clips = write_annotated()
     shifts = {RIGHT: (0.0, 0.02, 0.06), BOTH: (0.0, 0.03, 0.09)}
     predicted = [
         named(moved(clips[clip_id], (0, 0, shift)), f"{clip_id}~{number}")
-        for clip_id, row in shifts.items()
-        for number, shift in enumerate(row)
+        for clip_id, values_of_clip in shifts.items()
+        for number, shift in enumerate(values_of_clip)
     ]
-    found = evaluate_store(written(tmp_path / "three", predicted), root)
+    evaluation = evaluate_store(written(tmp_path / "three", predicted), root)
     alone = [
         evaluate_store(written(tmp_path / f"only-{k}", predicted[k::3]), root)["figures"]["contact_f1"]
         for k in range(3)
     ]
     mean, half = np.mean(alone), 4.302653 * np.std(alone, ddof=1) / np.sqrt(3)  # Student's t, 2 degrees of freedom
-    assert found["figures"]["contact_f1"] == pytest.approx(mean, abs=1e-6)
-    assert found["intervals"]["contact_f1"]["repetitions"] == pytest.approx([mean - half, mean + half], abs=2e-5)
-    assert "repetitions" not in found["intervals"]["joint_error_mm"]  # the best of all has no spread over them
+    assert evaluation["figures"]["contact_f1"] == pytest.approx(mean, abs=1e-6)
+    assert evaluation["intervals"]["contact_f1"]["repetitions"] == pytest.approx([mean - half, mean + half], abs=2e-5)
+    assert "repetitions" not in evaluation["intervals"]["joint_error_mm"]  # the best of all has no spread over them
     one = evaluate_store(written(tmp_path / "one", predicted[::3]), root)
     assert not any("repetitions" in ends for ends in one["intervals"].values())
 
 
-def test_clips_are_drawn_again_by_source_sequence_and_all_samples_go_with_their_clip(write_annotated, moved, tmp_path):
+def test_the_bootstrap_resamples_source_sequences_with_all_their_samples(write_annotated, moved, tmp_path):
     root, clips = write_annotated()
     predicted = [
         named(moved(clip, (0, 0, shift)), f"{clip_id}~{number}")
         for clip_id, clip in clips.items()
         for number, shift in enumerate((0.01, 0.03))
     ]
-    found = evaluate_store(written(tmp_path / "two", predicted), root)
-    # Two sequences: half of the draws have one of each, a quarter each twice the same.
+    evaluation = evaluate_store(written(tmp_path / "two", predicted), root)
+    # Two sequences: half of the resamples have one of each, a quarter each twice the same.
     each = [
         evaluate_store(written(tmp_path / clip_id[-1], [p for p in predicted if p.clip_id.startswith(clip_id)]), root)
         for clip_id in clips
     ]
     for name in ("jitter_m_s3", "contact_f1"):
         ends = sorted(one["figures"][name] for one in each)
-        assert found["intervals"][name]["clips"] == pytest.approx(ends, abs=2e-6)
+        assert evaluation["intervals"][name]["clips"] == pytest.approx(ends, abs=2e-6)
     assert not any("clips" in ends for ends in each[0]["intervals"].values())
 
 
-def test_clips_of_one_source_sequence_are_drawn_together():
+def test_clips_of_one_source_sequence_are_resampled_together():
     def clip(group, value):
-        return Measured(group, [Sample(0, {"jitter_m_s3": np.array([value])})], [])
+        return ClipResult(group, [Sample(0, {"jitter_m_s3": np.array([value])})], [])
 
     values = {"a": (1.0, 3.0), "b": (7.0, 9.0)}
-    apart = [clip(f"{name}{number}", value) for name, row in values.items() for number, value in enumerate(row)]
-    together = [clip(name, value) for name, row in values.items() for value in row]
+    apart = [
+        clip(f"{name}{number}", value)
+        for name, values_of_clip in values.items()
+        for number, value in enumerate(values_of_clip)
+    ]
+    together = [clip(name, value) for name, values_of_clip in values.items() for value in values_of_clip]
     assert intervals_of(metric("jitter_m_s3"), together) == {"clips": [2.0, 8.0]}  # one sequence twice, or the other
     low, high = intervals_of(metric("jitter_m_s3"), apart)["clips"]
     assert 1 < low < 5 < high < 9
     assert intervals_of(metric("jitter_m_s3"), together[:2]) == {}
 
 
-def test_intervals_stand_beside_figures_they_contain(write_annotated, moved, tmp_path):
+def test_intervals_contain_the_value_of_their_metric(write_annotated, moved, tmp_path):
     root, clips = write_annotated()
     predicted = [named(moved(c, (0, 0.01 * k, 0)), f"{c.clip_id}~{k}") for c in clips.values() for k in range(3)]
-    found = evaluate_store(written(tmp_path / "three", predicted), root)
-    assert set(found["intervals"]) <= set(found["figures"])
-    for name, ends in found["intervals"].items():
+    evaluation = evaluate_store(written(tmp_path / "three", predicted), root)
+    assert set(evaluation["intervals"]) <= set(evaluation["figures"])
+    for name, ends in evaluation["intervals"].items():
         for low, high in ends.values():
-            assert low - 1e-6 <= found["figures"][name] <= high + 1e-6, name
+            assert low - 1e-6 <= evaluation["figures"][name] <= high + 1e-6, name
 
 
 @pytest.mark.slow
-def test_figures_do_not_depend_on_the_number_of_processes(write_annotated, moved, tmp_path, monkeypatch):
+def test_results_do_not_depend_on_the_number_of_processes(write_annotated, moved, tmp_path, monkeypatch):
     monkeypatch.setattr("hoidata.metrics.evaluate.WORKERS_PAY_FROM", 0)
     root, clips = write_annotated()
     predicted = [named(moved(c, (0, 0.01 * k, 0)), f"{c.clip_id}~{k}") for c in clips.values() for k in range(2)]
@@ -209,26 +214,26 @@ def test_figures_do_not_depend_on_the_number_of_processes(write_annotated, moved
     assert json.dumps(one) == json.dumps(two)
 
 
-def test_contact_maps_asked_for_lie_beside_the_clips_one_per_motion(write_annotated, tmp_path):
+def test_target_contact_maps_are_read_per_motion(write_annotated, tmp_path):
     root, clips = write_annotated()
     first, second = (named(clips[RIGHT], f"{RIGHT}~{number}") for number in range(2))
     store = written(tmp_path / "mine" / "clips", [first, second, clips[BOTH]])
     assert "adherence" not in evaluate_store(store, root)["figures"]
     true = load_annotated(root).contact_of(RIGHT, "right") > 0
-    for asked, adherence in (([(first, true)], 1), ([(first, ~true)], 0), ([(first, true), (second, ~true)], 0.5)):
-        write_asked(store.parent, {motion.clip_id: own for motion, own in asked})
-        found = evaluate_store(store, root)
-        assert found["figures"]["adherence"] == adherence
-        assert found["counts"]["adherence"] == {"clips": 1, "motions": len(asked), "values": len(asked)}
+    for targets, adherence in (([(first, true)], 1), ([(first, ~true)], 0), ([(first, true), (second, ~true)], 0.5)):
+        write_asked(store.parent, {motion.clip_id: target for motion, target in targets})
+        evaluation = evaluate_store(store, root)
+        assert evaluation["figures"]["adherence"] == adherence
+        assert evaluation["counts"]["adherence"] == {"clips": 1, "motions": len(targets), "values": len(targets)}
     write_asked(store.parent, {first.clip_id: true[:-1]})
     reasons = {item["clip_id"]: item["reason"] for item in evaluate_store(store, root)["left_out"]}
-    assert reasons == {first.clip_id: "the contact map asked for has 255 points, 256 expected"}
+    assert reasons == {first.clip_id: "the target contact map has 255 points, 256 expected"}
     write_npz(store.parent / FILE_NAME, {"motion_id": np.array([RIGHT]), "asked": true})
     with pytest.raises(BadInput, match="motion_id"):
         evaluate_store(store, root)
 
 
-def test_motions_of_a_length_their_family_chose_are_not_compared_frame_by_frame(write_annotated, make_clip, tmp_path):
+def test_motions_of_estimated_length_are_not_compared_frame_by_frame(write_annotated, make_clip, tmp_path):
     root, clips = write_annotated()
     clip = clips[RIGHT]
     longer = clip.take(np.minimum(np.arange(15), 11))
@@ -237,50 +242,50 @@ def test_motions_of_a_length_their_family_chose_are_not_compared_frame_by_frame(
     predicted = [named(clip.take(slice(0, 10)), f"{RIGHT}~0"), named(longer, f"{RIGHT}~1"), clips[BOTH], handless]
     folder = tmp_path / "own"
     write_store(folder, predicted, generated_info("predicted", length="own"))
-    found = evaluate_store(folder, root)
-    assert (found["length"], found["motions"]) == ("own", 3)
-    assert [item["clip_id"] for item in found["left_out"]] == [f"{BOTH}~1"]
-    figures = found["figures"]
+    evaluation = evaluate_store(folder, root)
+    assert (evaluation["length"], evaluation["motions"]) == ("own", 3)
+    assert [item["clip_id"] for item in evaluation["left_out"]] == [f"{BOTH}~1"]
+    figures = evaluation["figures"]
     assert figures["length_error_frames"] == pytest.approx((2 + 3 + 0) / 3, abs=1e-6)
     assert figures["length_error_share"] == pytest.approx((2 + 3 + 0) / 3 / 12, abs=1e-6)
     assert not {item.name for item in METRICS if item.aligned} & set(figures)
     assert {"contact_f1", "jitter_m_s3", "penetration_mm", "slip_cm_s"} <= set(figures)
-    assert found["counts"]["jitter_m_s3"]["values"] == (10 - 3) + (15 - 3) + 2 * (12 - 3)
-    given = evaluate_store(written(tmp_path / "given", clips.values()), root)
-    assert given["length"] == "given"
-    assert "length_error_frames" not in given["figures"]
+    assert evaluation["counts"]["jitter_m_s3"]["values"] == (10 - 3) + (15 - 3) + 2 * (12 - 3)
+    given_length = evaluate_store(written(tmp_path / "given", clips.values()), root)
+    assert given_length["length"] == "given"
+    assert "length_error_frames" not in given_length["figures"]
 
 
 def absent(hand):
     return replace(hand, valid=np.zeros_like(hand.valid))
 
 
-def test_the_verb_of_a_motion_is_that_of_its_reference_and_its_limits_are_said(write_annotated, tmp_path):
+def test_a_motion_has_the_verb_of_its_reference_and_the_limits_are_reported(write_annotated, tmp_path):
     root, clips = write_annotated()
-    found = evaluate_store(written(tmp_path / "same", clips.values()), root)
-    assert found["actions"] == {"limits": [], "learnt": {}}  # too few training clips to learn from
-    assert found["figures"]["action_named"] == 1  # the one verb there is
-    assert "action_followed" not in found["figures"]
+    evaluation = evaluate_store(written(tmp_path / "same", clips.values()), root)
+    assert evaluation["actions"] == {"limits": [], "learnt": {}}  # too few training clips to learn from
+    assert evaluation["figures"]["action_named"] == 1  # the one verb there is
+    assert "action_followed" not in evaluation["figures"]
 
 
 def test_samples_are_taken_in_the_order_of_their_numbers():
     ids = ["a~10", "a~2", "b~0", "a", "b~x", "c"]
-    samples, left_out = matched(ids, ["a", "b"])
+    samples, skipped = match_predictions(ids, ["a", "b"])
     assert samples == {"a": ["a", "a~2", "a~10"], "b": ["b~0"]}
-    assert [item.clip_id for item in left_out] == ["b~x", "c"]
+    assert [item.clip_id for item in skipped] == ["b~x", "c"]
 
 
-def test_values_are_reduced_as_the_record_says():
+def test_values_are_reduced_as_registered():
     clips = [[np.array([1.0, 3.0]), np.array([5.0, 5.0, 5.0])], [np.array([8.0])], [np.zeros(0)]]
     best = replace(metric("joint_error_mm"), reduction="best of a clip's samples")
-    assert reduced(best, clips) == ((2 + 8) / 2, 2, 3, 6)
-    assert reduced(replace(best, direction="higher"), clips)[0] == (5 + 8) / 2
-    assert reduced(replace(best, reduction="mean over motions"), clips)[0] == (2 + 5 + 8) / 3
-    assert reduced(replace(best, reduction="mean over frames"), clips)[0] == 27 / 6
-    assert reduced(best, [[np.zeros(0)]]) is None
+    assert summarise(best, clips) == ((2 + 8) / 2, 2, 3, 6)
+    assert summarise(replace(best, direction="higher"), clips)[0] == (5 + 8) / 2
+    assert summarise(replace(best, reduction="mean over motions"), clips)[0] == (2 + 5 + 8) / 3
+    assert summarise(replace(best, reduction="mean over frames"), clips)[0] == 27 / 6
+    assert summarise(best, [[np.zeros(0)]]) is None
 
 
-def test_better_is_what_the_record_says():
+def test_better_follows_the_registered_direction():
     lower, higher = metric("joint_error_mm"), metric("contact_f1")
     assert is_better(lower, 1, 2, None)
     assert not is_better(lower, 2, 2, None)
@@ -296,66 +301,52 @@ def test_every_metric_is_registered_once_and_floors_have_their_metric():
     names = [item.name for item in METRICS]
     assert len(set(names)) == len(names) == len({item.title for item in METRICS})
     assert {item.floor_of for item in METRICS if item.floor_of} <= set(names)
-    directions = {item.name: item.direction for item in METRICS if item.direction != "lower" and not item.floor_of}
-    assert directions == {
-        "contact_f1": "higher",
-        "contact_precision": "higher",
-        "contact_recall": "higher",
-        "adherence": "higher",
-        "action_followed": "higher",
-        "action_named": "higher",
-        "realism_si": "higher",
-        "realism_released": "higher",
-        "contact_distance_mm": "nearer the truth",
-        "smoothness_m_s2": "nearer the truth",
-        "jitter_m_s3": "nearer the truth",
-        "object_jitter_m_s3": "nearer the truth",
-    }
+    assert {item.direction for item in METRICS} <= set(get_args(registry.Direction))
 
 
-def test_the_readme_is_the_one_the_registry_gives():
+def test_the_readme_is_generated_from_the_registry():
     path = Path(registry.__file__).with_name("README.md")
     assert path.read_text() == readme(), "run: python -m hoidata.metrics.describe > hoidata/metrics/README.md"
 
 
-def test_a_metric_that_no_clip_allows_is_listed_with_its_reason_and_their_number(make_clip, tmp_path):
-    def open_clip(*given, **named):
-        clip = make_clip(*given, **named)
+def test_unmeasured_metrics_are_listed_with_reason_and_number_of_clips(make_clip, tmp_path):
+    def open_clip(*given_length, **named):
+        clip = make_clip(*given_length, **named)
         sheet = replace(clip.object.model, faces=clip.object.model.faces[[4, 6]], name="sheet")  # the side above
         return replace(clip, object=replace(clip.object, model=sheet))
 
     root, clips = write_annotated_dataset(tmp_path / "annotated", open_clip)
-    every = with_lists(["bimart"])
-    found = evaluate_store(written(tmp_path / "same", clips.values()), root, metrics=every)
+    all_metrics = with_lists(["bimart"])
+    evaluation = evaluate_store(written(tmp_path / "same", clips.values()), root, metrics=all_metrics)
     no_inside = {"the object has no inside": 2}
     for name in ("penetration_mm", "deep_share", "penetration_volume_cm3", "bimart_pen_1cm_corrected"):
-        assert name not in found["figures"]
-        assert found["unmeasured"][name] == no_inside
-    assert found["unmeasured"]["hand_hand_mm"] == {"one hand acts alone": 1}
-    assert found["counts"]["hand_hand_mm"]["clips"] == 1
-    assert found["unmeasured"]["adherence"] == {"the motion was made without a target contact map": 2}
-    assert found["unmeasured"]["bimart_art_paper"] == {"the object has no hinge": 2}
-    assert set(found["figures"]) | set(found["unmeasured"]) == {item.name for item in every}
-    for item in every:  # each clip was measured, or there is a reason
-        measured = found["counts"].get(item.name, {"clips": 0})["clips"]
-        assert measured + sum(found["unmeasured"].get(item.name, {}).values()) == 2
+        assert name not in evaluation["figures"]
+        assert evaluation["unmeasured"][name] == no_inside
+    assert evaluation["unmeasured"]["hand_hand_mm"] == {"one hand acts alone": 1}
+    assert evaluation["counts"]["hand_hand_mm"]["clips"] == 1
+    assert evaluation["unmeasured"]["adherence"] == {"the motion was made without a target contact map": 2}
+    assert evaluation["unmeasured"]["bimart_art_paper"] == {"the object has no hinge": 2}
+    assert set(evaluation["figures"]) | set(evaluation["unmeasured"]) == {item.name for item in all_metrics}
+    for item in all_metrics:  # each clip was measured, or there is a reason
+        measured = evaluation["counts"].get(item.name, {"clips": 0})["clips"]
+        assert measured + sum(evaluation["unmeasured"].get(item.name, {}).values()) == 2
 
 
-def test_what_cannot_be_compared_frame_by_frame_says_so_where_a_family_chose_the_length(write_annotated, tmp_path):
+def test_aligned_metrics_report_the_reason_for_motions_of_estimated_length(write_annotated, tmp_path):
     root, clips = write_annotated()
     shorter = [named(clips[RIGHT].take(slice(0, 10)), f"{RIGHT}~{number}") for number in range(2)]
     write_store(tmp_path / "own", shorter, generated_info("predicted", length="own"))
-    found = evaluate_store(tmp_path / "own", root, metrics=with_lists(["bimart"]))
+    evaluation = evaluate_store(tmp_path / "own", root, metrics=with_lists(["bimart"]))
     reason = {"the family chose the length, so frames cannot be compared": 1}
     aligned = [item.name for item in with_lists(["bimart"]) if item.aligned]
     assert len(aligned) == 3
-    assert [found["unmeasured"][name] for name in aligned] == [reason] * 3
-    given = evaluate_store(written(tmp_path / "given", clips.values()), root)
-    assert given["unmeasured"]["length_error_frames"] == {"the length was given": 2}
+    assert [evaluation["unmeasured"][name] for name in aligned] == [reason] * 3
+    given_length = evaluate_store(written(tmp_path / "given", clips.values()), root)
+    assert given_length["unmeasured"]["length_error_frames"] == {"the length was given": 2}
 
 
-def test_clips_of_an_empty_selection_of_frames_say_which_frames_were_asked_for():
+def test_the_reason_for_no_selected_frame_names_the_selection():
     slip = metric("slip_cm_s")
-    assert registry.unmeasured(slip, [[np.zeros(0)], [np.zeros(0), np.ones(2)], []]) == {
+    assert registry.count_unmeasured(slip, [[np.zeros(0)], [np.zeros(0), np.ones(2)], []]) == {
         f"no such frame: {slip.frames}": 2
     }

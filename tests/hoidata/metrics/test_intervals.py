@@ -20,7 +20,7 @@ def test_a_bootstrap_over_single_clips_is_as_wide_as_the_normal_interval():
     assert (low, high) == pytest.approx((values.mean() - half, values.mean() + half), abs=0.15 * half)
 
 
-def test_clips_of_one_sequence_are_drawn_together():
+def test_clips_of_one_sequence_are_resampled_together():
     values = np.repeat(np.random.default_rng(2).normal(size=40), 25)
     alone, together = bootstrap_interval(values, np.arange(1000)), bootstrap_interval(values, np.repeat(range(40), 25))
     assert together.high - together.low == pytest.approx(5 * (alone.high - alone.low), rel=0.15)
@@ -32,7 +32,7 @@ def test_equal_inputs_give_equal_intervals_in_any_order_of_clips_and_groups_of_a
     assert bootstrap_interval(values[order], groups[order]) == pytest.approx(bootstrap_interval(values, groups))
 
 
-def test_one_group_has_no_interval_and_draws_without_a_figure_are_left_out():
+def test_one_group_has_no_interval_and_undefined_resamples_are_skipped():
     assert bootstrap_interval(np.ones(5), np.zeros(5)) is None
 
     def first_alone(values, weights):

@@ -1,4 +1,4 @@
-"""Every metric on motions whose figure is known."""
+"""Every metric on motions with known values."""
 
 from dataclasses import replace
 
@@ -36,26 +36,26 @@ def along_the_face(clip, depth_m):
 
 def test_joint_error_is_the_length_of_a_known_shift(make_clip, moved, pair_of):
     clip = make_clip(10)
-    found = motion.joint_error_mm(pair_of(moved(clip, (0.003, 0.004, 0.0)), clip), 1)
-    assert found == pytest.approx(np.full(10, 5.0), abs=1e-3)
+    values = motion.joint_error_mm(pair_of(moved(clip, (0.003, 0.004, 0.0)), clip), 1)
+    assert values == pytest.approx(np.full(10, 5.0), abs=1e-3)
 
 
 def test_joint_error_counts_left_and_right_apart(make_clip, moved, pair_of):
     clip = make_clip(6, "both")
-    found = motion.joint_error_mm(pair_of(moved(clip, (0.0, 0.01, 0.0), ["left"]), clip, "both"), 1)
-    assert found == pytest.approx(np.repeat([10.0, 0.0], 6), abs=1e-3)
+    values = motion.joint_error_mm(pair_of(moved(clip, (0.0, 0.01, 0.0), ["left"]), clip, "both"), 1)
+    assert values == pytest.approx(np.repeat([10.0, 0.0], 6), abs=1e-3)
 
 
-def test_a_hand_that_was_not_asked_for_changes_no_metric(make_clip, moved, pair_of):
+def test_an_inactive_hand_changes_no_metric(make_clip, moved, pair_of):
     clip = make_clip(10)
     garbage = moved(clip, clip.object.translation_m - clip.hands["left"].wrist_m, ["left"])  # inside the box
     one, other = pair_of(clip, clip, table_m=-1.0), pair_of(garbage, clip, table_m=-1.0)
     for metric in METRICS:
-        found, again = (metric.measure(own, metric.every) for own in (one, other))
-        assert found == again if isinstance(found, Unmeasured) else found.tolist() == again.tolist(), metric.name
+        values, again = (metric.measure(pair, metric.frame_step) for pair in (one, other))
+        assert values == again if isinstance(values, Unmeasured) else values.tolist() == again.tolist(), metric.name
 
 
-def test_frames_in_which_the_reference_lost_the_hand_are_not_looked_at(make_clip, moved, pair_of):
+def test_frames_without_the_hand_in_the_reference_are_not_measured(make_clip, moved, pair_of):
     clip = make_clip(9)
     valid = np.ones(9, bool)
     valid[2:5] = False
@@ -79,8 +79,8 @@ def test_smoothness_is_a_known_acceleration_in_the_wrist_frame(make_clip, pair_o
     joints = np.zeros((8, 21, 3))
     joints += (2.0 * time**2)[:, None, None]  # the whole hand accelerates: the wrist frame goes along
     joints[:, 1:, 0] += 0.5 * 3.0 * time[:, None] ** 2
-    found = motion.smoothness(with_joints(pair_of(clip, clip), joints), 1)
-    assert found == pytest.approx([3.0 * 20 / 21])
+    values = motion.smoothness(with_joints(pair_of(clip, clip), joints), 1)
+    assert values == pytest.approx([3.0 * 20 / 21])
 
 
 def test_jitter_is_a_known_jerk_in_the_world(make_clip, pair_of):
@@ -88,22 +88,22 @@ def test_jitter_is_a_known_jerk_in_the_world(make_clip, pair_of):
     time = np.arange(8) / FPS
     joints = np.zeros((8, 21, 3))
     joints[..., 1] = (7.0 / 6 * time**3 + 5 * time**2)[:, None]
-    found = motion.jitter_m_s3(with_joints(pair_of(clip, clip), joints), 1)
-    assert found == pytest.approx(np.full(5, 7.0))
+    values = motion.jitter_m_s3(with_joints(pair_of(clip, clip), joints), 1)
+    assert values == pytest.approx(np.full(5, 7.0))
 
 
-def test_jitter_of_an_object_is_a_known_jerk_of_its_middle_wherever_its_mesh_begins(make_clip, pair_of):
+def test_object_jitter_is_a_known_jerk_of_its_centre_wherever_the_mesh_origin_is(make_clip, pair_of):
     """Turned about its middle an object has none, though its origin goes round."""
     clip, time = make_clip(20), np.arange(20) / FPS
-    turn = np.stack([np.zeros(20), np.zeros(20), np.sin(9 * time)], 1)
+    swing = np.stack([np.zeros(20), np.zeros(20), np.sin(9 * time)], 1)
     vertices_m = clip.object.model.vertices_m + np.array([0.1, 0, 0])
     middle, model = (vertices_m.min(0) + vertices_m.max(0)) / 2, replace(clip.object.model, vertices_m=vertices_m)
-    way = np.stack([7.0 / 6 * time**3, 5 * time**2, time], 1)
-    origin = way - Rotation.from_rotvec(turn).apply(middle)
-    track = replace(clip.object, model=model, rotvec=turn.astype(np.float32), translation_m=origin.astype(np.float32))
+    path = np.stack([7.0 / 6 * time**3, 5 * time**2, time], 1)
+    origin = path - Rotation.from_rotvec(swing).apply(middle)
+    track = replace(clip.object, model=model, rotvec=swing.astype(np.float32), translation_m=origin.astype(np.float32))
     moving = replace(clip, object=track)
-    found = motion.object_jitter_m_s3(pair_of(moving, moving), 1)
-    assert found == pytest.approx(np.full(17, 7.0), abs=0.1)
+    values = motion.object_jitter_m_s3(pair_of(moving, moving), 1)
+    assert values == pytest.approx(np.full(17, 7.0), abs=0.1)
     assert np.linalg.norm(np.diff(origin, n=3, axis=0), axis=1).max() * FPS**3 > 40
 
 
@@ -122,7 +122,7 @@ def test_penetration_is_the_depth_of_the_deepest_vertex_in_a_box(make_clip, move
     assert touch.penetration_mm(pair_of(away, clip), 1).tolist() == [0.0] * 12
 
 
-def test_the_deep_share_counts_frames_below_ten_millimetres(make_clip, moved, pair_of):
+def test_deep_share_counts_frames_deeper_than_ten_millimetres(make_clip, moved, pair_of):
     clip = make_clip(4)
     shifts = [along_the_face(clip, depth)[frame] for frame, depth in enumerate((0.005, 0.011, 0.02, -0.1))]
     pair = pair_of(moved(clip, np.array(shifts)), clip)
@@ -152,25 +152,26 @@ def test_an_object_without_an_inside_has_no_penetration(make_clip, pair_of):
     assert motion.realism_si(pair_of(clip, clip, table_m=-1.0), 1) == NO_INSIDE
 
 
-def test_contact_distance_is_that_of_joints_that_touch_in_the_truth(make_clip, moved, pair_of):
+def test_contact_distance_is_of_joints_in_contact_in_the_recording(make_clip, moved, pair_of):
     clip = make_clip(6)
     lifted = moved(clip, along_the_face(clip, -0.05))
     pair = pair_of(lifted, clip)
-    true, made = (to_box_m(one.joints_in_object("right", np.arange(6))) for one in (pair.reference, pair.predicted))
+    motions = (pair.reference, pair.predicted)
+    true, generated = (to_box_m(item.joints_in_object("right", np.arange(6))) for item in motions)
     touching = np.abs(true) < 0.02
     assert 0 < touching.sum() < touching.size
-    assert touch.contact_distance_mm(pair, 1) == pytest.approx(1000 * np.abs(made)[touching], abs=1e-3)
+    assert touch.contact_distance_mm(pair, 1) == pytest.approx(1000 * np.abs(generated)[touching], abs=1e-3)
     assert len(touch.contact_distance_mm(pair_of(clip, lifted), 1)) == 0  # nothing touches in that truth
 
 
-def test_contact_f1_compares_the_points_touched_with_those_of_the_truth(make_clip, moved, pair_of):
+def test_contact_f1_compares_touched_points_with_the_recording(make_clip, moved, pair_of):
     clip = make_clip(6)
     pair = pair_of(clip, clip)
-    made = touch.touched_points(pair)
+    generated = touch.touched_points(pair)
     assert touch.contact_f1(pair, 1) == [1.0]
-    count, missed = int(made.sum()), np.flatnonzero(~made)
-    other = made.copy()
-    other[np.flatnonzero(made)[: count // 2]] = False
+    count, missed = int(generated.sum()), np.flatnonzero(~generated)
+    other = generated.copy()
+    other[np.flatnonzero(generated)[: count // 2]] = False
     other[missed[: 3 * count]] = True
     true_count, hits = int(other.sum()), count - count // 2
     pair = replace(pair, contact=replace(pair.contact, touched=other))
@@ -180,7 +181,7 @@ def test_contact_f1_compares_the_points_touched_with_those_of_the_truth(make_cli
     assert touch.contact_f1(away, 1) == [0.0]
 
 
-def test_contact_is_made_at_the_threshold_of_the_reference(make_clip, pair_of):
+def test_contact_uses_the_threshold_of_the_reference(make_clip, pair_of):
     clip = make_clip(6)
     narrow, wide = (touch.touched_points(pair_of(clip, clip, threshold_m=reach)) for reach in (0.012, 0.02))
     assert 0 < narrow.sum() < wide.sum()
@@ -205,7 +206,11 @@ def on_a_hand(make_clip, fall_m_s2=0.0, hand_below_m=0.0):
     zeros = np.zeros((n_frames, 3), np.float32)
     orient = np.tile(np.float32([np.pi / 2, 0, 0]), (n_frames, 1))
     hand = HandTrack(
-        zeros, orient, np.zeros((n_frames, 45), np.float32), np.zeros((1, 10), np.float32), zeros[:, 0] == 0
+        wrist_m=zeros,
+        global_orient=orient,
+        hand_pose=np.zeros((n_frames, 45), np.float32),
+        betas=np.zeros((1, 10), np.float32),
+        valid=zeros[:, 0] == 0,
     )
     capsules = hand_capsules(hand, load_embedded_hands().right)
     top = (np.maximum(capsules.start_m, capsules.end_m)[0, :, 2] + capsules.radius_m).max()
@@ -218,15 +223,15 @@ def on_a_hand(make_clip, fall_m_s2=0.0, hand_below_m=0.0):
 
 
 def test_a_plate_at_rest_on_a_hand_is_realistic_and_one_in_the_air_is_not(make_clip, pair_of):
-    held, floating = on_a_hand(make_clip), on_a_hand(make_clip, hand_below_m=0.5)
+    carried, floating = on_a_hand(make_clip), on_a_hand(make_clip, hand_below_m=0.5)
     for measure in (motion.realism_si, motion.realism_as_released):
-        assert measure(pair_of(held, floating, table_m=-1.0), 1).tolist() == [1.0] * 12
-        assert measure(pair_of(floating, held, table_m=-1.0), 1).tolist() == [0.0] * 12
+        assert measure(pair_of(carried, floating, table_m=-1.0), 1).tolist() == [1.0] * 12
+        assert measure(pair_of(floating, carried, table_m=-1.0), 1).tolist() == [0.0] * 12
     for floor in (motion.floor_si, motion.floor_as_released):
-        assert floor(pair_of(held, held, table_m=-1.0), 1).tolist() == [0.0] * 12
+        assert floor(pair_of(carried, carried, table_m=-1.0), 1).tolist() == [0.0] * 12
 
 
-def test_the_floor_is_what_falls_by_itself(make_clip, pair_of):
+def test_realism_without_hands_is_one_only_in_free_fall(make_clip, pair_of):
     """As released, gravity is ten times too small: an object that falls that slowly needs no hand."""
     free, slow = on_a_hand(make_clip, 9.81, 0.5), on_a_hand(make_clip, 0.98, 0.5)
     assert motion.floor_si(pair_of(free, free, table_m=-1.0), 1).all()
@@ -236,18 +241,18 @@ def test_the_floor_is_what_falls_by_itself(make_clip, pair_of):
     assert motion.floor_as_released(pair_of(slow, slow, table_m=-1.0), 1)[:-2].all()
 
 
-def test_every_name_in_the_registry_gives_the_figure_it_names(make_clip, pair_of):
-    """Figures that tell all metrics of forces, meshes and derivatives from each other."""
+def test_every_registered_metric_measures_what_its_name_says(make_clip, pair_of):
+    """Motions on which the metrics of forces, meshes and derivatives all have different values."""
 
     def figures(pair):
-        found = {metric.name: metric.measure(pair, metric.every) for metric in METRICS}
-        # Without the last two frames, in which forward differences have nothing.
-        inner = {name: values[:-2] if len(values) > 2 else values for name, values in found.items()}
+        by_metric = {metric.name: metric.measure(pair, metric.frame_step) for metric in METRICS}
+        # Without the last two frames, in which forward differences are undefined.
+        inner = {name: values[:-2] if len(values) > 2 else values for name, values in by_metric.items()}
         return {name: float(values.mean()) for name, values in inner.items() if len(values)}
 
-    held, slow = on_a_hand(make_clip), on_a_hand(make_clip, 0.98, 0.5)
-    carried = figures(pair_of(held, held, table_m=-1.0))
-    alone = {name: value for name, value in figures(pair_of(slow, held, table_m=-1.0)).items() if "realism" in name}
+    on_hand, slow = on_a_hand(make_clip), on_a_hand(make_clip, 0.98, 0.5)
+    carried = figures(pair_of(on_hand, on_hand, table_m=-1.0))
+    alone = {name: value for name, value in figures(pair_of(slow, on_hand, table_m=-1.0)).items() if "realism" in name}
     assert (carried["realism_si"], carried["realism_released"]) == (1, 1)
     assert (carried["realism_si_floor"], carried["realism_released_floor"]) == (0, 0)
     assert alone == {
@@ -262,35 +267,35 @@ def test_every_name_in_the_registry_gives_the_figure_it_names(make_clip, pair_of
     time = np.arange(12) / FPS
     joints = np.zeros((12, 21, 3))
     joints[:, 1:, 0] += 7.0 / 6 * time[:, None] ** 3
-    moving = figures(with_joints(pair_of(held, held), joints))
+    moving = figures(with_joints(pair_of(on_hand, on_hand), joints))
     assert moving["jitter_m_s3"] == pytest.approx(7.0 * 20 / 21)
     assert moving["smoothness_m_s2"] == pytest.approx(7.0 * 20 / 21 * time[1:-1].mean())
 
 
-def test_forces_are_asked_about_above_the_table_of_the_truth_only(make_clip, pair_of):
-    held = on_a_hand(make_clip)
-    assert len(motion.realism_si(pair_of(held, held, table_m=-BOTTOM_M), 1)) == 0
-    assert len(motion.realism_si(pair_of(held, held, table_m=-BOTTOM_M - 0.02), 1)) == 12
-    assert len(motion.realism_si(pair_of(held, held, table_m=-BOTTOM_M - 0.02), 3)) == 4
-    assert motion.realism_si(pair_of(held, held, table_m=None), 1) == NO_GRAVITY
+def test_realism_is_scored_only_above_the_table_of_the_recording(make_clip, pair_of):
+    carried = on_a_hand(make_clip)
+    assert len(motion.realism_si(pair_of(carried, carried, table_m=-BOTTOM_M), 1)) == 0
+    assert len(motion.realism_si(pair_of(carried, carried, table_m=-BOTTOM_M - 0.02), 1)) == 12
+    assert len(motion.realism_si(pair_of(carried, carried, table_m=-BOTTOM_M - 0.02), 3)) == 4
+    assert motion.realism_si(pair_of(carried, carried, table_m=None), 1) == NO_GRAVITY
 
 
 def test_capsule_depth_is_how_far_capsules_reach_over_a_plane(make_clip, pair_of):
-    held = on_a_hand(make_clip)
-    capsules = hand_capsules(held.hands["right"], load_embedded_hands().right)
+    carried = on_a_hand(make_clip)
+    capsules = hand_capsules(carried.hands["right"], load_embedded_hands().right)
     depth = np.maximum(capsules.start_m, capsules.end_m)[0, :, 2] + capsules.radius_m + BOTTOM_M
     expected = 1000 * depth[depth > 0].mean()
     assert (depth > 0).sum() > 3
-    assert motion.capsule_depth_mm(pair_of(held, held, table_m=-1.0), 1) == pytest.approx([expected], abs=1e-3)
+    assert motion.capsule_depth_mm(pair_of(carried, carried, table_m=-1.0), 1) == pytest.approx([expected], abs=1e-3)
     floating = on_a_hand(make_clip, hand_below_m=0.5)
-    assert len(motion.capsule_depth_mm(pair_of(floating, held, table_m=-1.0), 1)) == 0
+    assert len(motion.capsule_depth_mm(pair_of(floating, carried, table_m=-1.0), 1)) == 0
 
 
-def test_a_motion_is_judged_by_the_verb_of_its_reference(make_clip, pair_of):
+def test_a_motion_is_evaluated_with_the_verb_of_its_reference(make_clip, pair_of):
     clip = make_clip(30)
     lifted = with_object(clip, translation_m=clip.object.translation_m + np.linspace(0, 0.5, 30)[:, None] * [0, 0, 1])
     untouched = np.zeros((2, 30), bool)
-    lift, rest = (action_numbers(own.object, np.array([0.0, 0.0, -1.0]), untouched) for own in (lifted, clip))
+    lift, rest = (action_numbers(moved.object, np.array([0.0, 0.0, -1.0]), untouched) for moved in (lifted, clip))
     learnt = learn_actions({"lift": [lift] * 3, "pour": [rest] * 3})
     actions = replace(learnt, limits={"lift": {"end_rise_m": (0.35, 0.9)}})
     for predicted, verb, followed in ((lifted, "lift", [1.0]), (clip, "lift", [0.0]), (lifted, "juggle", [])):

@@ -40,7 +40,7 @@ def pair_of(clip: Clip, hands: HandPair) -> Pair:
     points = sample_points(clip.object.model, 16)
     contact = TrueContact(ProximityIndex(points), points.part, np.zeros(16, bool), 0.02)
     motion = Motion(clip, {}, hands)
-    return Pair(motion, motion, SIDES, contact, None)
+    return Pair(motion, motion, SIDES, contact, table_m=None)
 
 
 @pytest.mark.slow
@@ -51,8 +51,8 @@ def test_recorded_hands_are_rarely_deeper_than_1_cm_in_the_whole_posed_mesh(clip
         deep.append(bimart.pen_1cm_paper(pair, 1))
         assert np.isfinite(bimart._deepest_paper_m(pair)).any()
         assert not np.isposinf(bimart._deepest_paper_m(pair)).any()
-    share = np.concatenate(deep).mean()
-    assert 0 < share < 6  # by the sign of each open part it is over 20 %
+    deep_fraction = np.concatenate(deep).mean()
+    assert 0 < deep_fraction < 6  # by the sign of each open part it is over 20 %
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""What the pages' tests share: a made-up clip (hands beside a carried box), an independent glTF reader."""
+"""Fixtures of the page tests: a synthetic clip (hands at a carried box) and an independent glTF reader."""
 
 import shutil
 from dataclasses import replace
@@ -23,7 +23,7 @@ def hand_track(wrist_m: np.ndarray, orient: np.ndarray, valid: bool, curl_rad: f
     pose = np.zeros((frames, 15, 3))
     pose[:, :12, 2] = np.linspace(0.1, curl_rad, frames)[:, None]
     betas = np.linspace(-1, 1, 10)[None]
-    return HandTrack(wrist_m, orient, pose.reshape(frames, 45), betas, np.full(frames, valid))
+    return HandTrack(wrist_m, orient, pose.reshape(frames, 45), betas, valid=np.full(frames, valid))
 
 
 def page_model(hinged: bool = False) -> ObjectModel:
@@ -85,9 +85,11 @@ class GltfFile:
         inverse_bind = self.array(skin.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1)
         bones = np.stack([self.world_matrix(joint, frame, world=False) for joint in skin.joints]) @ inverse_bind
         attributes = self.document.meshes[item.mesh].primitives[0].attributes
-        place = np.c_[self.array(attributes.POSITION), np.ones(self.document.accessors[attributes.POSITION].count)]
+        homogeneous = np.c_[
+            self.array(attributes.POSITION), np.ones(self.document.accessors[attributes.POSITION].count)
+        ]
         joints, weights = self.array(attributes.JOINTS_0), self.array(attributes.WEIGHTS_0)
-        return np.einsum("vk,vkij,vj->vi", weights, bones[joints], place)[:, :3]
+        return np.einsum("vk,vkij,vj->vi", weights, bones[joints], homogeneous)[:, :3]
 
     def placed(self, name: str, frame: int) -> np.ndarray:
         """Vertices of a rigid mesh node at a frame, in the clip's own world frame."""
@@ -129,8 +131,8 @@ def read_glb():
 @pytest.fixture
 def chromium() -> list[str]:
     """The browser and what makes it open a page without a window."""
-    found = shutil.which("chromium") or shutil.which("google-chrome")
-    if found is None:
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
         pytest.skip("no chromium on PATH: the page was not opened")
     drawing = ("--disable-gpu", "--enable-unsafe-swiftshader", "--use-angle=swiftshader")
-    return [found, "--headless", "--no-sandbox", *drawing, "--no-first-run"]
+    return [browser, "--headless", "--no-sandbox", *drawing, "--no-first-run"]

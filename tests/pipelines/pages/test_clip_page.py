@@ -1,4 +1,4 @@
-"""The page of one clip: its series against formulas of the test, what the page says, and that it repeats."""
+"""The page of one clip: time series against independent formulas, texts, and equal bytes."""
 
 import base64
 import json
@@ -80,10 +80,10 @@ def world_points(annotated, clip):
         local = points.points_m.astype(np.float64).copy()
         if clip.object.model.hinge is not None:
             hinge, moves = clip.object.model.hinge, points.part == 1
-            turn = Rotation.from_rotvec(np.asarray(hinge.axis) * clip.object.hinge_rad[frame]).as_matrix()
-            local[moves] = (local[moves] - hinge.origin_m) @ turn.T + hinge.origin_m
-        turn = Rotation.from_rotvec(clip.object.rotvec[frame]).as_matrix()
-        placed.append(local @ turn.T + clip.object.translation_m[frame])
+            rotation = Rotation.from_rotvec(np.asarray(hinge.axis) * clip.object.hinge_rad[frame]).as_matrix()
+            local[moves] = (local[moves] - hinge.origin_m) @ rotation.T + hinge.origin_m
+        rotation = Rotation.from_rotvec(clip.object.rotvec[frame]).as_matrix()
+        placed.append(local @ rotation.T + clip.object.translation_m[frame])
     return np.stack(placed)
 
 
@@ -122,7 +122,7 @@ def test_lift_and_speed_are_those_of_the_objects_middle(dataset, hands):
     assert measure_clip(dataset, dataset.clip("test/s2/far"), hands).lift_m is None
 
 
-def test_depth_is_how_far_a_vertex_lies_within_the_box(dataset, hands):
+def test_depth_is_the_distance_of_a_vertex_inside_the_box(dataset, hands):
     """Rigid box of 8 x 12 x 6 cm: the depth of an inner point is its distance to the nearest of six planes."""
     clip = dataset.clip("test/s2/box")
     track = clip.hands["right"]
@@ -141,7 +141,7 @@ def test_depth_is_how_far_a_vertex_lies_within_the_box(dataset, hands):
 
 
 def test_hand_against_the_surface_is_that_of_the_box(dataset, hands):
-    """Distance to a box of 8 x 12 x 6 cm by formula: from joints, and vertices nearer than 5 mm."""
+    """Distance of joints to a box of 8 x 12 x 6 cm by formula, and vertices closer than 5 mm."""
     clip = dataset.clip("test/s2/box")
     series = measure_clip(dataset, clip, hands)
     track = clip.hands["right"]
@@ -157,7 +157,7 @@ def test_hand_against_the_surface_is_that_of_the_box(dataset, hands):
 def test_packed_distances_of_every_frame_are_bimarts_in_steps(dataset, hands):
     clip = dataset.clip("test/s1/lid")
     points, series = dataset.points("lidded box"), measure_clip(dataset, clip, hands)
-    maps = {side: found.map_m for side, found in series.surface.items()}
+    maps = {side: measured.map_m for side, measured in series.surface.items()}
     values = json.loads(json.dumps(paint_values(clip, points, series.touched, maps)))
     placed = world_points(dataset, clip)
     for side in ("left", "right"):
@@ -180,9 +180,9 @@ def test_packed_contact_of_every_frame_unpacks_to_the_touched_points(dataset, ha
     for side in ("left", "right"):
         data = base64.b64decode(values[side])
         for frame in (0, 11, 23):
-            row = data[frame * values["stride"] : (frame + 1) * values["stride"]]
-            found = [point for point in range(len(points)) if row[point // 8] >> (7 - point % 8) & 1]
-            assert found == np.flatnonzero(touched[side][frame]).tolist()
+            packed = data[frame * values["stride"] : (frame + 1) * values["stride"]]
+            unpacked = [point for point in range(len(points)) if packed[point // 8] >> (7 - point % 8) & 1]
+            assert unpacked == np.flatnonzero(touched[side][frame]).tolist()
 
 
 def test_every_painted_mesh_of_the_glb_finds_its_points_where_its_vertices_are(dataset, hands, read_glb, tmp_path):
@@ -195,21 +195,21 @@ def test_every_painted_mesh_of_the_glb_finds_its_points_where_its_vertices_are(d
     for part in values["parts"]:
         node = glb.document.nodes[glb.node(part["mesh"])]
         vertices = glb.array(glb.document.meshes[node.mesh].primitives[0].attributes.POSITION)
-        place = np.array(part["tenth_mm"]).reshape(-1, 3) * 1e-4
-        np.testing.assert_allclose(place.min(axis=0), vertices.min(axis=0), atol=0.012)
-        np.testing.assert_allclose(place.max(axis=0), vertices.max(axis=0), atol=0.012)
+        position_m = np.array(part["tenth_mm"]).reshape(-1, 3) * 1e-4
+        np.testing.assert_allclose(position_m.min(axis=0), vertices.min(axis=0), atol=0.012)
+        np.testing.assert_allclose(position_m.max(axis=0), vertices.max(axis=0), atol=0.012)
 
 
-def test_page_tells_words_evidence_quality_split_and_sources(dataset, page):
+def test_page_shows_sentences_evidence_quality_split_and_sources(dataset, page):
     text = page("test/s2/box").read_text()
     for sentence in dataset.sentences("test/s2/box"):
         assert sentence in text
     assert f'<td>s2/&lt;box&gt;.npz</td><td class="number">12,345</td><td>{SHA256}</td>' in text
     assert "<h2>Hand type: right</h2>" in text
     assert '<td>right</td><td class="number">19 of 24</td><td>yes</td>' in text
-    assert '<td>left</td><td class="number">0 of 24</td><td>no</td><td class="number">never seen</td>' in text
-    assert "exact surface in place of the points the hand type is the same." in text
-    assert "The source names no hand." in text
+    assert '<td>left</td><td class="number">0 of 24</td><td>no</td><td class="number">never visible</td>' in text
+    assert "exact surface in place of sampled points the hand type is the same." in text
+    assert "The source has no label of the hand." in text
     assert "cam4, images 700 to 723" in text
     assert "(chosen)</td><td>test</td>" in text
     assert "(0, 0, -1), stated by the source" in text
@@ -217,18 +217,18 @@ def test_page_tells_words_evidence_quality_split_and_sources(dataset, page):
 
 
 def test_page_gives_the_nearest_distances_in_centimetres(dataset, page, hands):
-    """Of the right hand where it is there: from a joint to a sampled point, and to the box by formula."""
+    """Distances of the right hand in its valid frames: joint to sampled point, and joint to the box by formula."""
     clip = dataset.clip("test/s2/box")
     track = clip.hands["right"]
     joints, points = track_joints(track, hands["right"]).astype(np.float64), world_points(dataset, clip)
     to_points = np.linalg.norm(joints[:, :, None] - points[:, None], axis=3)[track.valid].min()
     to_surface = box_distance_m(clip, joints)[track.valid].min()
-    [row] = re.findall(r"<td>right</td>.*?</tr>", page("test/s2/box").read_text(), re.S)
-    shown = [float(number) for number in re.findall(r"([\d.]+) cm<", row)]
+    [cells] = re.findall(r"<td>right</td>.*?</tr>", page("test/s2/box").read_text(), re.S)
+    shown = [float(number) for number in re.findall(r"([\d.]+) cm<", cells)]
     assert shown == pytest.approx([100 * to_points, 100 * to_surface], abs=0.0051)
 
 
-def test_fit_to_keypoints_is_told_with_its_error_in_millimetres(dataset, hands):
+def test_fit_to_keypoints_is_shown_with_its_error_in_millimetres(dataset, hands):
     fitted = replace(dataset.clip("test/s2/box"), hands_from="keypoints", fit_error_m=0.0042)
     said = dict(clip_facts(dataset, fitted, hands))["hands from"]
     assert said == "a hand model fitted to the source's keypoints, mean error 4.2 mm"
@@ -238,21 +238,21 @@ def test_frames_that_were_interpolated_are_counted(dataset, hands):
     clip = dataset.clip("test/s2/box")
     numbers = np.arange(clip.n_frames, dtype=np.int32)
     numbers[[4, 5, 9]] = 3, 3, 8
-    said = [dict(clip_facts(dataset, replace(clip, source_frames=own), hands))["source frames"]
-            for own in (np.arange(clip.n_frames, dtype=np.int32), numbers)]  # fmt: skip
+    said = [dict(clip_facts(dataset, replace(clip, source_frames=source_frames), hands))["source frames"]
+            for source_frames in (np.arange(clip.n_frames, dtype=np.int32), numbers)]  # fmt: skip
     assert "interpolated" not in said[0]
     assert said[1].endswith(f"; 3 of {clip.n_frames} frames are interpolated")
 
 
 def test_page_says_where_annotator_and_distances_disagree(page):
     text = page("test/s1/lid").read_text()
-    assert "annotator named: right, which DISAGREES" in text
+    assert "Label of the source: right, which DISAGREES" in text
     assert "with a hinge" in text
     assert text.count('<div class="readout"') == 7
 
 
 @pytest.mark.slow
-def test_page_says_whose_word_the_hand_type_is_where_the_annotators_is_wanted(dataset, hands, tmp_path):
+def test_page_names_the_source_of_the_hand_type_if_labels_are_used(dataset, hands, tmp_path):
     contact = read_contact_settings(dataset.root / "contact")
     annotate_store(
         dataset.root / "clips",
@@ -262,27 +262,27 @@ def test_page_says_whose_word_the_hand_type_is_where_the_annotators_is_wanted(da
         hand="annotated-else-proximity",
     )
     annotated = load_annotated(dataset.root, hands)
-    for clip_id, words in (("test/s1/lid", "as here."), ("test/s2/box", "which is not so here.")):
+    for clip_id, words in (("test/s1/lid", "as for this clip."), ("test/s2/box", "but not for this clip.")):
         text = write_clip_page(tmp_path / "page.html", annotated, clip_id, hands).read_text()
-        assert f"Where the source's annotator named a hand, that one is taken instead, {words}" in unescape(text)
+        assert f"If the source has a label of the hand, the label is used instead, {words}" in unescape(text)
         assert "<h2>Hand type: right</h2>" in text
 
 
 @pytest.mark.slow
 def test_verb_derived_from_the_motion_is_marked_as_derived(page_clip, hands, tmp_path):
-    """A box lifted by 20 cm under the hand, of which its source says no word."""
+    """A box lifted by 20 cm under the hand, without a label in the source."""
     clips, rule = [replace(page_clip(), verb=None)], {**SPLIT, "test": []}
     root = write_annotated(tmp_path / "grab", clips, "grab", rule, THRESHOLD_M, quality=True)
     text = write_clip_page(tmp_path / "page.html", load_annotated(root, hands), "test/box_lift", hands).read_text()
     assert re.search(r"<dd>lift, derived from the motion \(.+\): the source has no label</dd>", text)
 
 
-def test_clip_without_words_says_why_and_still_has_its_page(page):
+def test_clip_without_sentences_has_a_page_with_the_reason(page):
     text = page("test/s2/far").read_text()
     assert "No sentences: no joint within 9 cm of the object" in text
     assert "<h2>Hand type: none</h2>" in text
     assert '<td>right</td><td class="number">19 of 24</td><td>no</td>' in text
-    assert "It is not known where down is" in text
+    assert "The direction of gravity is unknown" in text
     assert "No hand comes within 9 cm of the object." in text
 
 
@@ -314,7 +314,7 @@ def test_values_under_the_cursor_are_empty_where_a_hand_is_not_valid(dataset, ha
     series = measure_clip(dataset, dataset.clip("test/s2/box"), hands)
     charts = clip_charts(series, ["right"], 1024)
     near = draw_timeline(charts, "salt").charts[1]
-    assert near.title == "nearest joint to the object"
+    assert near.title == "distance of the closest joint to the object"
     values = near.lines[0]["values"]
     assert values[5:10] == [None] * 5
     assert values[4] == pytest.approx(series.evidence.distance_m["right"][4] * 100, abs=0.05)

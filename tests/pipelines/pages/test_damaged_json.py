@@ -1,4 +1,4 @@
-"""JSON files that stages wrote and somebody changed: every reader says which entry is wrong, or reads on."""
+"""Damaged JSON files of stages: every reader names the wrong entry, or does not need it."""
 
 import copy
 import json
@@ -15,14 +15,14 @@ from hoidata.contact.settings import read_contact_settings
 from hoidata.errors import BadInput, HoidataError
 from hoidata.files.written import Facts, read_json, read_json_rows
 from hoidata.store.annotated import load_annotated
-from pipelines.figures import LEADING, write_figures
+from pipelines.expected_orderings import check_orderings, read_methods
 from pipelines.lineage.check import compare_made
 from pipelines.lineage.manifests import read_manifest
+from pipelines.metrics_files import LEADING, write_dvc_metrics
 from pipelines.pages import quality
 from pipelines.pages.clip_page_facts import clip_quality
 from pipelines.pages.dataset_page import split_rows
 from pipelines.pages.metrics_table import markdown_table, metrics_tables
-from pipelines.promises import kept, read_rows
 from pipelines.run_facts import describe_results
 from pipelines.stages.base import StagePaths, hand_is_present
 from pipelines.stages.evaluate import _with_reasons
@@ -100,10 +100,10 @@ def read_all_metrics() -> None:
     families = ("text2hoi", "ground-truth", "mean-pose")
     metrics_tables(METRICS, families)
     markdown_table(METRICS, families, LEADING)
-    kept(read_rows(METRICS))
+    check_orderings(read_methods(METRICS))
     shutil.rmtree("figures", ignore_errors=True)
     Path("figures").mkdir()
-    write_figures(Path("figures"), METRICS.parent, Path("checkpoints"), {"grab": families})
+    write_dvc_metrics(Path("figures"), METRICS.parent, Path("checkpoints"), {"grab": families})
 
 
 def read_a_manifest() -> None:
@@ -132,7 +132,7 @@ READERS: dict[str, list[Callable[[], object]]] = {
 
 
 def damaged(values: Any, depth: int = 3, most: int = 24) -> Iterator[Any]:
-    """The value with one entry renamed, or replaced by a value of another type; in objects inside of it too."""
+    """The value with one entry renamed or replaced by a value of another type, nested objects included."""
     yield [] if isinstance(values, dict) else {}
     entries = values.items() if isinstance(values, dict) else enumerate(values)
     for name, value in list(entries)[:most]:
@@ -148,16 +148,16 @@ def damaged(values: Any, depth: int = 3, most: int = 24) -> Iterator[Any]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file", READERS)
-def test_a_changed_file_is_told_in_words_by_all_that_read_it(here, file):
-    path, messages, seen = here / file, [], set()
+def test_all_readers_of_a_damaged_file_name_the_entry(here, file):
+    path, messages, damages = here / file, [], set()
     values = json.loads(path.read_text())
     for reader in READERS[file]:
         reader()
     for changed in damaged(values):
         text = json.dumps(changed)
-        if text in seen:
+        if text in damages:
             continue
-        seen.add(text)
+        damages.add(text)
         path.write_text(text)
         for reader in READERS[file]:
             try:

@@ -1,4 +1,4 @@
-"""The page of one dataset: counts, examples, what was left out; and `hoidata show`, which finds a clip by its id."""
+"""The page of one dataset: counts, examples, skipped sequences; and `hoidata show`, which finds a clip by its id."""
 
 import re
 import shutil
@@ -27,7 +27,9 @@ from pipelines.showing import closest_ids, find_clip, write_shown
 from tests.builders.stores import write_annotated, write_clips
 
 SPLIT = {"by": "subject", "train": "rest", "test": ["s2"], "promises": ["subject"]}
-LEFT_OUT = Quarantined("grab/s1/mug_1", "s1/mug_1.npz", "finite numbers", "NaN in <frame 3>", "download it again")
+LEFT_OUT = Quarantined(
+    "grab/s1/mug_1", "s1/mug_1.npz", "finite numbers", "NaN in <frame 3>", remedy="download it again"
+)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +53,7 @@ def written(page_clip, tmp_path_factory):
 
 @pytest.fixture
 def project(written, tmp_path, monkeypatch):
-    """The dataset's folder in a copy of it, which is the current folder."""
+    """The dataset's folder in a copied project, which is the current folder."""
     shutil.copytree(written, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     return tmp_path / "data" / "embedded" / "grab"
@@ -72,7 +74,7 @@ def test_page_counts_lists_and_links(project, hands, tmp_path):
     assert '<dt>box</dt><dd><i style="width:100.0%"></i><span>3</span></dd>' in text
     assert "<dt>lidded &lt;box&gt;</dt>" in text
     assert "<dt>both</dt>" in text
-    assert "<dt>none acts</dt>" in text
+    assert "<dt>none is active</dt>" in text
     assert "Shortest 0.80 s, median 0.80 s, longest 1.00 s." in text
     assert re.search(r"<td>grab/s1/box_far</td><td>no joint within 9 cm", text)
     assert "NaN in &lt;frame 3&gt;" in text
@@ -115,7 +117,7 @@ def test_contact_and_penetration_by_object_are_counted_over_frames(page_clip, ha
     far = {side: replace(track, wrist_m=track.wrist_m + np.float32(1)) for side, track in alone.hands.items()}
     clips = [replace(clip, hands=tracks), replace(alone, hands=far)]
     annotated = load_annotated(write_annotated(tmp_path / "grab", clips, "grab", SPLIT, 0.09, quality=True), hands)
-    rows = {row.name: row for row in contact_by_object(annotated)}
+    rows = {record.name: record for record in contact_by_object(annotated)}
     assert list(rows) == ["all objects", "box", "lidded box"]
     assert (rows["box"].touching, rows["lidded box"].touching) == ("50.0 %", "0.0 %")
     # Quality control looks at every fifth frame: 10, 15 and 20 of 0, 5, ..., 25.
@@ -129,19 +131,19 @@ def test_contact_and_penetration_by_object_are_counted_over_frames(page_clip, ha
 def test_page_shows_contact_and_penetration(project, hands, tmp_path):
     text = write_dataset_page(tmp_path / "out", project, "grab", hands, examples=0).read_text()
     assert "<h3>Contact and penetration</h3>" in text
-    assert "within 9 cm of one of the object" in text
+    assert "within 9 cm of a sampled point of the object" in text
     assert '<td>all objects</td><td class="number">4</td><td class="number">102</td>' in text
 
 
-def test_object_without_an_inside_has_no_depths_in_the_table(page_clip, hands, tmp_path):
+def test_object_that_is_not_solid_has_no_depths_in_the_table(page_clip, hands, tmp_path):
     clip = page_clip()
     plate = replace(clip.object.model, faces=clip.object.model.faces[:2], name="plate")
     other = replace(page_clip(frames=30), clip_id="test/s2/open", subject="s2")
     clips = [clip, replace(other, object=replace(other.object, model=plate))]
     annotated = load_annotated(write_annotated(tmp_path / "grab", clips, "grab", SPLIT, 0.09, quality=True), hands)
-    every, box, open_mesh = contact_by_object(annotated)
+    all_objects, box, open_mesh = contact_by_object(annotated)
     assert (open_mesh.name, open_mesh.deep, open_mesh.deepest) == ("plate", "not measured", "not measured")
-    assert (every.deep, every.deepest) == (box.deep, box.deepest)
+    assert (all_objects.deep, all_objects.deepest) == (box.deep, box.deepest)
 
 
 @pytest.mark.slow
@@ -150,7 +152,7 @@ def test_page_repeats_byte_for_byte(project, hands, tmp_path):
     assert first.read_bytes() == second.read_bytes()
 
 
-def test_examples_show_what_is_new_first(project, hands):
+def test_examples_cover_different_clips_first(project, hands):
     annotated = load_annotated(project, hands)
     assert example_ids(annotated, 2) == ["grab/s1/box_1", "grab/s2/lid_1"]
     assert len(example_ids(annotated, 9)) == 3
@@ -204,12 +206,12 @@ def test_unknown_clip_names_the_closest_ones(project, tmp_path):
     assert closest_ids("FAR", ["s/box", "s/afar", "s/far"])[:2] == ["s/afar", "s/far"]
 
 
-def test_sequence_left_out_when_converting_is_named_with_its_reason(project, tmp_path):
-    with pytest.raises(BadInput, match=r"left out when converting: s1/mug_1\.npz: expected finite numbers, got NaN"):
+def test_a_skipped_sequence_is_named_with_its_reason(project, tmp_path):
+    with pytest.raises(BadInput, match=r"skipped in conversion: s1/mug_1\.npz: expected finite numbers, got NaN"):
         write_shown("grab/s1/mug_1", "embedded", tmp_path)
 
 
-def test_what_has_not_run_is_named(project, tmp_path):
+def test_a_missing_stage_is_named(project, tmp_path):
     with pytest.raises(MissingResource, match="h2o has no clips to show: it was not converted"):
         write_shown("h2o", "embedded", tmp_path)
     with pytest.raises(MissingResource, match="no dataset of the profile own is converted"):

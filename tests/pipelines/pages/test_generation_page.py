@@ -1,4 +1,4 @@
-"""What a generated motion is written as: arrays, an animated model, and a page that fetches nothing."""
+"""The files of a generated motion: arrays, an animated model, and a self-contained page."""
 
 import contextlib
 import re
@@ -41,7 +41,8 @@ def motion(page_clip):
         "refined_by": "contact_refinement",
         "trained_on": {"grab": 12},
     }
-    return GeneratedMotion(clip, page_clip(frames=clip.n_frames), points.points_m[:, 0] > 0.039, points, evidence)
+    coarse, contact = page_clip(frames=clip.n_frames), points.points_m[:, 0] > 0.039
+    return GeneratedMotion(clip, coarse, contact, points, evidence=evidence)
 
 
 @pytest.fixture
@@ -86,13 +87,13 @@ def test_a_person_s_rest_meshes_are_among_the_arrays(motion, hands, write):
     with np.load(write(replace(motion, clip=replace(motion.clip, hands=tracks)))[0]) as archive:
         arrays = dict(archive)
     names = ("wrist_m", "global_orient", "hand_pose", "betas", "valid")
-    own = HandTrack(*(arrays[name][1] for name in names), arrays["template_m"][1])
-    assert np.allclose(track_joints(own, hands.right), arrays["joints_m"][1], atol=1e-6)
+    right_track = HandTrack(*(arrays[name][1] for name in names), arrays["template_m"][1])
+    assert np.allclose(track_joints(right_track, hands.right), arrays["joints_m"][1], atol=1e-6)
     with np.load(write(motion, to="without")[0]) as archive:
         assert archive["template_m"].size == 0
 
 
-def test_page_names_seed_hands_length_models_and_what_was_never_seen(motion, write):
+def test_page_names_seed_hands_length_models_and_untrained_inputs(motion, write):
     page = write(motion)[-1].read_text()
     for words in (
         "right (decided by rule: the right &lt;hand&gt;)",
@@ -104,19 +105,19 @@ def test_page_names_seed_hands_length_models_and_what_was_never_seen(motion, wri
         "z is &lt;taken&gt; for up",
         "Lift a box &amp; hold it",
         "sample 1: the best of 3 motions",
-        "sample 1: moves most like &#39;pour&#39;, highest rise 15.8 cm (usual: &lt;19.1&gt; to 23.7)",
+        "sample 1: motion classified as &#39;pour&#39;, highest rise 15.8 cm (usual: &lt;19.1&gt; to 23.7)",
     ):
         assert words in page, words
 
 
-def test_contact_that_was_reached_is_that_of_joints_near_points(motion, hands, write):
+def test_generated_contact_is_that_of_joints_near_points(motion, hands, write):
     reached = reached_contact(motion, hands)
     track = motion.clip.hands["right"]
     entries = ProximityIndex(motion.points).entries(
         track_joints(track, hands.right), track.valid, motion.clip.object, 0.02
     )
     assert set(np.flatnonzero(reached)) == set(entries["point"].tolist())
-    assert f"{reached.sum()} reached" in write(motion)[-1].read_text()
+    assert f"{reached.sum()} touched points" in write(motion)[-1].read_text()
 
 
 def test_every_array_is_explained_on_the_page(motion, write):

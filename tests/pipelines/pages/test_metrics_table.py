@@ -1,4 +1,4 @@
-"""The table of metrics: every family beside the others, what is best, and who loses to a clip that was looked up."""
+"""The table of metrics: all methods compared, the best one, and comparisons with retrieval baselines."""
 
 import json
 
@@ -8,10 +8,10 @@ import pytest
 from hoidata.errors import BadInput
 from hoidata.metrics.registry import metric
 from pipelines.pages.metrics_table import (
-    NO_FIGURE,
+    NOT_COMPUTED,
     OTHER_EVALUATOR,
     best_families,
-    loses_to,
+    is_worse_than,
     markdown_table,
     metrics_tables,
     number,
@@ -58,8 +58,8 @@ def page_of(folder):
 
 
 def cells_of(table, family):
-    """The cells of one row by the titles of their columns."""
-    number = [row.family for row in table.rows].index(family)
+    """The cells of one method by the titles of their columns."""
+    number = [method.family for method in table.methods].index(family)
     return {
         column[0]: cell
         for topic in table.topics
@@ -71,60 +71,69 @@ def title(name):
     return metric(name).title
 
 
-def test_rows_are_families_then_controls_and_columns_what_one_of_them_has(folder):
+def test_lines_are_families_then_controls_and_columns_are_measured_metrics(folder):
     table = table_of(folder)
-    assert [row.family for row in table.rows] == [*FAMILIES, "static"]
-    assert [row.kind for row in table.rows] == ["family", "family", "family", "lookup", "truth", "control"]
+    assert [method.family for method in table.methods] == [*FAMILIES, "static"]
+    assert [method.kind for method in table.methods] == [
+        "family",
+        "family",
+        "family",
+        "retrieval",
+        "recorded",
+        "control",
+    ]
     columns = {column[0]: column[1:] for topic in table.topics for column in topic.columns}
     assert columns[title("joint_error_mm")] == ("mm", "lower is better")
-    assert columns[title("realism_si_floor")] == ("", "a floor")
-    assert columns[title("jitter_m_s3")] == ("m/s3", "nearer the truth")
+    assert columns[title("realism_si_floor")] == ("", "lower bound")
+    assert columns[title("jitter_m_s3")] == ("m/s3", "closer to recorded is better")
     assert len(columns) == 5
-    rows = {row.family: row for row in table.rows}
+    methods = {method.family: method for method in table.methods}
     assert cells_of(table, "ours")[title("joint_error_mm")].text == "30.0"
-    assert cells_of(table, "static")[title("joint_error_mm")].text == NO_FIGURE
-    assert rows["untrained"].empty == "not trained: <length>"
-    assert rows["absent"].empty == "not evaluated"
-    assert rows["ours"].note == "16 motions of 2 clips, 1 left out"
-    assert rows["ours"].diagnostics == [("length mae frames", "10.2")]
+    assert cells_of(table, "static")[title("joint_error_mm")].text == NOT_COMPUTED
+    assert methods["untrained"].empty == "not trained: <length>"
+    assert methods["absent"].empty == "not evaluated"
+    assert methods["ours"].note == "16 motions of 2 clips, 1 skipped"
+    assert methods["ours"].diagnostics == [("length mae frames", "10.2")]
 
 
-def test_the_best_family_is_marked_and_one_that_loses_to_the_lookup_said_in_words(folder):
+def test_the_best_family_is_marked_and_one_worse_than_retrieval_is_named(folder):
     table = table_of(folder)
     marks = {name: {key: cell.mark for key, cell in cells_of(table, name).items()} for name in FIGURES}
     contact, jitter, joints = title("contact_f1"), title("jitter_m_s3"), title("joint_error_mm")
     assert (marks["ours"][joints], marks["ours"][contact], marks["ours"][jitter]) == ("good", "bad", "bad")
     assert (marks["nearest-clip"][joints], marks["nearest-clip"][contact]) == ("", "good")
     assert not any(marks["ground-truth"].values())
-    words = {row.family: row.words for row in table.rows}
-    assert words["ours"] == "loses to nearest-clip in 2 of 4 figures"
-    assert next(row.lost for row in table.rows if row.family == "ours") == [f"to nearest-clip: {contact}, {jitter}"]
-    assert not words["nearest-clip"]
-    assert not words["static"]  # a control is there to lose
+    summary = {method.family: method.summary for method in table.methods}
+    assert summary["ours"] == "worse than nearest-clip in 2 of 4 metrics"
+    assert next(method.worse_in for method in table.methods if method.family == "ours") == [
+        f"worse than nearest-clip: {contact}, {jitter}"
+    ]
+    assert not summary["nearest-clip"]
+    assert not summary["static"]  # a control is expected to be worse
 
 
-def test_nearer_the_truth_needs_the_truth():
+def test_closer_to_recorded_needs_the_recorded_value():
     column = {"ours": 9.0, "nearest-clip": 12.0}
     assert best_families(metric("jitter_m_s3"), column) == []
-    assert not loses_to("nearest-clip", metric("jitter_m_s3"), "ours", column)
+    assert not is_worse_than("nearest-clip", metric("jitter_m_s3"), "ours", column)
     assert best_families(metric("jitter_m_s3"), column | {"ground-truth": 8.0}) == ["ours"]
 
 
-def test_figures_of_another_evaluator_are_not_set_beside_each_other(folder):
+def test_values_of_different_evaluators_are_not_compared(folder):
     other = {"evaluators": {"corrected": {"digest": "bb"}}}
     (folder / "controls" / "static.json").write_text(written({ACCURACY: 0.9}, **other))
     table = table_of(folder)
-    cells = [cell for cell in cells_of(table, "static").values() if cell.text != NO_FIGURE]
+    cells = [cell for cell in cells_of(table, "static").values() if cell.text != NOT_COMPUTED]
     assert [cell.text for cell in cells] == [OTHER_EVALUATOR]
     assert not [chart for topic in table.topics for chart in topic.charts if "accuracy" in chart.title]
 
 
-def test_a_figure_that_must_not_be_given_says_why(folder):
+def test_a_missing_value_has_its_reason(folder):
     (folder / "controls" / "static.json").write_text(written({}, notes={ACCURACY: "N too small"}))
     assert "N too small" in {cell.text for cell in cells_of(table_of(folder), "static").values()}
 
 
-def test_a_chart_has_a_bar_for_every_row_with_its_intervals_on_one_scale(folder):
+def test_a_chart_has_a_bar_for_every_method_with_its_intervals_on_one_scale(folder):
     charts = {chart.title: chart for topic in table_of(folder).topics for chart in topic.charts}
     chart = charts[title("contact_f1")]
     bars = {bar.family: bar for bar in chart.bars}
@@ -135,35 +144,35 @@ def test_a_chart_has_a_bar_for_every_row_with_its_intervals_on_one_scale(folder)
     assert chart.ends == ("0.00", "1.00")
 
 
-def test_the_page_says_it_and_escapes_what_it_is_given(folder):
+def test_the_page_shows_comparisons_and_escapes_text(folder):
     text = page_of(folder)
-    assert "<b>ours</b> loses to nearest-clip in 2 of 4 figures." in text
-    assert f"to nearest-clip: {title('contact_f1')}" in text
+    assert "<b>ours</b>: worse than nearest-clip in 2 of 4 metrics." in text
+    assert f"worse than nearest-clip: {title('contact_f1')}" in text
     assert '<td class="number good">30.0</td>' in text
     assert "untrained: not evaluated, not trained: &lt;length&gt;" in text
-    assert "What ours says of its own networks" in text
+    assert "Diagnostics of the networks of ours" in text
     assert 'title="0.400 to 0.700"' in text
     assert text.count("<svg") == 5
 
 
-def test_markdown_marks_in_words_what_loses(folder):
+def test_markdown_marks_values_worse_than_retrieval(folder):
     lines = markdown_table(folder, FAMILIES, ["joint_error_mm", "contact_f1"]).splitlines()
-    assert lines[0].startswith("| row | joint error of the best sample, mm (lower is better) |")
+    assert lines[0].startswith("| method | joint error of the best sample, mm (lower is better) |")
     assert lines[2:] == [
-        "| ours | 30.0 | 0.500 (loses) |", "| nearest-clip | 40.0 | 0.600 |", "| ground-truth | 0.00 | 1.00 |",
-        "| static | - | 0.200 |", "", "- untrained: not evaluated, not trained: <length>",
-        "- absent: not evaluated, not evaluated",
+        "| ours | 30.0 | 0.500 (worse than retrieval) |", "| nearest-clip | 40.0 | 0.600 |",
+        "| ground-truth | 0.00 | 1.00 |", "| static | - | 0.200 |", "",
+        "- untrained: not evaluated, not trained: <length>", "- absent: not evaluated, not evaluated",
     ]  # fmt: skip
     with pytest.raises(BadInput, match="contact_f1"):
         markdown_table(folder, FAMILIES, ["contact_f2"])
 
 
 def test_the_terminal_shows_intervals_and_reasons():
-    found = json.loads(
+    evaluation = json.loads(
         written({"contact_f1": 0.5}, counts={"contact_f1": {"clips": 2, "motions": 4, "values": 4}},
                 intervals={"contact_f1": {"clips": [0.4, 0.7]}}, notes={ACCURACY: "N too small"})
     )  # fmt: skip
-    cells = [list(column.cells) for column in printed_table(found).columns]
+    cells = [list(column.cells) for column in printed_table(evaluation).columns]
     assert cells[1] == ["0.500", "N too small"]
     assert cells[2] == ["0.400 to 0.700", ""]
 
@@ -178,7 +187,7 @@ PENETRATION, LENGTH, LENGTH_SHARE = "penetration_mm", "length_error_frames", "le
 
 @pytest.fixture
 def partly(folder):
-    """``ours`` has a penetration in 3 of 10 clips, ``static`` in none; no row has an error of its length."""
+    """``ours`` has a penetration in 3 of 10 clips, ``static`` in none; no method has a length error."""
     for path, figures, missing in (
         (folder / "ours.json", FIGURES["ours"] | {PENETRATION: 2.0}, 7),
         (folder / "controls" / "static.json", {"contact_f1": 0.2}, 10),
@@ -186,20 +195,20 @@ def partly(folder):
         (folder / "ground-truth.json", FIGURES["ground-truth"], 10),
     ):
         unmeasured = {PENETRATION: {NO_INSIDE: missing}} if missing else {}
-        given = {"the length was given": 10}
-        more = {"unmeasured": unmeasured | {LENGTH: given, LENGTH_SHARE: given}}
+        length_given = {"the length was given": 10}
+        more = {"unmeasured": unmeasured | {LENGTH: length_given, LENGTH_SHARE: length_given}}
         path.write_text(written(figures, counts={PENETRATION: {"clips": 10 - missing}}, **more))
     return folder
 
 
-def test_a_metric_measured_in_some_clips_says_in_how_many_and_why_not_in_the_others(partly):
+def test_a_metric_measured_in_some_clips_reports_the_coverage_and_the_reason(partly):
     cells = {name: cells_of(table_of(partly), name)[title(PENETRATION)] for name in ("ours", "nearest-clip", "static")}
-    assert (cells["ours"].share, cells["ours"].note) == ("3 of 10", f"not measured: {NO_INSIDE}: 7 clips")
-    assert (cells["nearest-clip"].share, cells["nearest-clip"].note) == ("", "")
+    assert (cells["ours"].coverage, cells["ours"].note) == ("3 of 10", f"not measured: {NO_INSIDE}: 7 clips")
+    assert (cells["nearest-clip"].coverage, cells["nearest-clip"].note) == ("", "")
     assert (cells["static"].text, cells["static"].note) == ("not measured", f"{NO_INSIDE}: 10 clips")
 
 
-def test_a_metric_that_no_row_has_stands_below_its_topic_with_the_reason(partly):
+def test_an_unmeasured_metric_is_listed_below_its_topic_with_the_reason(partly):
     topic = next(topic for topic in table_of(partly).topics if topic.unmeasured)
     titles = f"{title(LENGTH)}; {title(LENGTH_SHARE)}"
     assert topic.unmeasured == [(titles, "the length was given: 10 clips")]
@@ -209,12 +218,12 @@ def test_a_metric_that_no_row_has_stands_below_its_topic_with_the_reason(partly)
     assert "3 of 10 clips</span>" in text
 
 
-def test_a_chart_names_the_rows_it_has_no_bar_for(partly):
+def test_a_chart_names_the_methods_without_a_bar(partly):
     charts = {chart.title: chart for topic in table_of(partly).topics for chart in topic.charts}
     assert charts[f"{title(PENETRATION)}, mm"].missing == "not measured: ground-truth, static"
 
 
-def test_markdown_says_below_what_was_not_measured(partly):
+def test_markdown_lists_unmeasured_metrics_below_the_table(partly):
     lines = markdown_table(partly, FAMILIES, [PENETRATION, LENGTH]).splitlines()
     assert "| ours | 2.00 (3 of 10 clips) | not measured |" in lines
     assert "| static | not measured | not measured |" in lines
@@ -225,10 +234,10 @@ def test_markdown_says_below_what_was_not_measured(partly):
 
 
 def test_the_terminal_lists_metrics_that_were_not_measured(partly):
-    found = json.loads((partly / "controls" / "static.json").read_text())
-    found["counts"] = {"contact_f1": {"clips": 10}}
-    columns = [list(column.cells) for column in printed_table(found).columns]
-    rows = {name: (figure, clips) for name, figure, clips in zip(columns[0], columns[1], columns[-1], strict=True)}
-    assert rows[title(PENETRATION)] == ("not measured", "0 of 10")
-    assert rows[title("contact_f1")] == ("0.200", "10")
-    assert f"not measured: {title(PENETRATION)}: {NO_INSIDE}: 10 clips" in unmeasured_lines(found)
+    evaluation = json.loads((partly / "controls" / "static.json").read_text())
+    evaluation["counts"] = {"contact_f1": {"clips": 10}}
+    columns = [list(column.cells) for column in printed_table(evaluation).columns]
+    methods = {name: (figure, clips) for name, figure, clips in zip(columns[0], columns[1], columns[-1], strict=True)}
+    assert methods[title(PENETRATION)] == ("not measured", "0 of 10")
+    assert methods[title("contact_f1")] == ("0.200", "10")
+    assert f"not measured: {title(PENETRATION)}: {NO_INSIDE}: 10 clips" in unmeasured_lines(evaluation)

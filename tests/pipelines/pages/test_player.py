@@ -1,4 +1,4 @@
-"""The GLB of a motion against formulas of the test, and the player that shows it."""
+"""The GLB of a motion against independent formulas, and the player that shows it."""
 
 import base64
 import zlib
@@ -42,8 +42,8 @@ def test_skeleton_nodes_lie_on_the_joints_of_the_track(hands, page_clip, read_gl
     glb = read_glb(write_glb(tmp_path / "motion.glb", clip, hands))
     joints = track_joints(clip.hands["right"], hands.right)[7]
     for joint, name in ((0, "wrist"), (3, "index3"), (15, "thumb3")):
-        place = glb.world_matrix(glb.node(f"right {name}"), 7, world=False)[:3, 3]
-        assert np.abs(place - joints[joint]).max() < 1e-4
+        position = glb.world_matrix(glb.node(f"right {name}"), 7, world=False)[:3, 3]
+        assert np.abs(position - joints[joint]).max() < 1e-4
 
 
 def test_hand_that_is_never_valid_is_not_in_the_file(hands, page_clip, read_glb, tmp_path):
@@ -68,9 +68,9 @@ def test_moving_part_turns_about_the_hinge_line(hands, page_clip, read_glb, tmp_
     lid = model.vertices_m[model.part == 1]
     expected = (lid - model.hinge.origin_m) @ angle.T + model.hinge.origin_m
     expected = expected @ Rotation.from_rotvec(track.rotvec[frame]).as_matrix().T + track.translation_m[frame]
-    found = glb.placed("lidded box part mesh", frame)
-    assert np.abs(np.sort(found.min(axis=0)) - np.sort(expected.min(axis=0))).max() < 1e-5
-    assert np.abs(found.max(axis=0) - expected.max(axis=0)).max() < 1e-5
+    part_vertices = glb.placed("lidded box part mesh", frame)
+    assert np.abs(np.sort(part_vertices.min(axis=0)) - np.sort(expected.min(axis=0))).max() < 1e-5
+    assert np.abs(part_vertices.max(axis=0) - expected.max(axis=0)).max() < 1e-5
 
 
 def test_gravity_points_down_in_the_viewer(page_clip):
@@ -98,10 +98,10 @@ def test_touched_corner_is_painted_and_the_far_side_is_not(hands, page_clip, rea
     paint = ContactPaint(points, np.zeros(1024), (np.linalg.norm(points - corner, axis=1) < 0.03).astype(float))
     glb = read_glb(write_glb(tmp_path / "motion.glb", clip, hands, paint))
     attributes = glb.document.meshes[glb.document.nodes[glb.node("box base mesh")].mesh].primitives[0].attributes
-    place, colour = glb.array(attributes.POSITION), glb.array(attributes.COLOR_0)
+    position, colour = glb.array(attributes.POSITION), glb.array(attributes.COLOR_0)
     red = contact_colours(np.array([1.0]))[0]
-    assert (colour[np.linalg.norm(place - corner, axis=1) < 0.015] == red).all()
-    assert (colour[np.linalg.norm(place + corner, axis=1) < 0.02] == contact_colours(np.array([0.0]))[0]).all()
+    assert (colour[np.linalg.norm(position - corner, axis=1) < 0.015] == red).all()
+    assert (colour[np.linalg.norm(position + corner, axis=1) < 0.02] == contact_colours(np.array([0.0]))[0]).all()
 
 
 def test_full_contact_is_painted_full_everywhere_and_no_points_paint_nothing():

@@ -1,4 +1,4 @@
-"""The report's section on quality control: every measure, its limits, and what was left out and why."""
+"""The report's section on quality control: measures, limits, and excluded clips with reasons."""
 
 from dataclasses import asdict, replace
 
@@ -32,9 +32,9 @@ def folders(hands, page_clip, tmp_path_factory):
     return folders
 
 
-def test_page_says_what_was_left_out_and_why(folders, hands, tmp_path):
+def test_page_lists_excluded_clips_with_reasons(folders, hands, tmp_path):
     text = write_report(tmp_path / "report", "embedded", {"grab": ["ground-truth"]}, hands, folders).read_text()
-    assert "Of 3 clips 2 are sound, 0 are warned of and kept, 1 are left out of annotation" in text
+    assert "Of 3 clips 2 pass, 0 have warnings and 1 are excluded from annotation" in text
     assert f"<td>test/s1/1</td><td>{JUMP}</td>" in text
     assert "<td>open box</td><td>warned</td><td>share of edges at a hole" in text
     assert "penetration not measured: the mesh of open box is not solid (1 clip)." in text
@@ -42,11 +42,11 @@ def test_page_says_what_was_left_out_and_why(folders, hands, tmp_path):
     assert text.count("<svg") == 1
 
 
-def test_every_measure_has_its_row_with_median_worst_and_counts(folders):
+def test_every_measure_is_listed_with_median_worst_and_counts(folders):
     facts = read_quality(folders.data / "grab" / "quality", "grab")
     assert facts is not None
-    assert [row.words for row in facts.clips] == [measure.words for measure in CLIP_MEASURES]
-    assert [row.words for row in facts.meshes] == [measure.words for measure in MESH_MEASURES]
+    assert [measure_row.words for measure_row in facts.clips] == [measure.words for measure in CLIP_MEASURES]
+    assert [measure_row.words for measure_row in facts.meshes] == [measure.words for measure in MESH_MEASURES]
     jump = facts.clips[5]
     assert (jump.median, jump.worst, jump.worst_id) == ("0", "1.74", "test/s1/1")
     assert (jump.warn, jump.leave_out, jump.warned, jump.left_out) == ("0.05", "0.2", 0, 1)
@@ -78,7 +78,7 @@ def test_chart_shows_limits_within_reach_as_lines_and_names_those_beyond():
     assert all("#c98a00" in chart for chart in (near, far))
 
 
-def test_measure_that_was_never_taken_is_not_drawn():
+def test_unmeasured_measures_have_no_chart():
     two = [measure for measure in CLIP_MEASURES if measure.name in ("penetration_m", "gap_share")]
     chart = measures_svg(table(gap_share=[0.0, 0.1]), two, LIMITS, "a")
     assert "gap share" in chart

@@ -9,7 +9,7 @@ from hoidata.clips.quarantine import Quarantined
 from hoidata.store.annotated import load_annotated
 from models.common.predicting import sample_family
 from models.registry import load_family
-from pipelines.figures import write_figures
+from pipelines.metrics_files import write_dvc_metrics
 from pipelines.pages.curves import Curve, Panel, log_curves, panels_svg, read_log
 from pipelines.pages.examples import shown_ids
 from pipelines.pages.player import three_javascript
@@ -23,11 +23,13 @@ FAMILIES = ("ground-truth", "text2hoi")
 
 @pytest.fixture
 def folders(hands, page_clip, tmp_path):
-    """Two datasets: one of three clips (one subject held out) and a sequence left out, one empty."""
+    """Two datasets: one with three clips (one subject held out) and a skipped sequence, and an empty one."""
     folders = ReportFolders.of("embedded", tmp_path)
     names = ("s1", "s2", "s3")
     clips = [replace(page_clip(hinged=name == "s2"), clip_id=f"test/{name}/box", subject=name) for name in names]
-    left_out = Quarantined("test/s1/mug", "s1/mug.npz", "finite numbers", "NaN in <frame 3>", "download it again")
+    left_out = Quarantined(
+        "test/s1/mug", "s1/mug.npz", "finite numbers", "NaN in <frame 3>", remedy="download it again"
+    )
     root = folders.data / "grab"
     write_annotated(root, [*clips, left_out], "grab", HELD_OUT, 0.2)
     (folders.data / "arctic" / "clips").mkdir(parents=True)
@@ -54,10 +56,10 @@ def write(folders, hands, out, *datasets):
     return write_report(out, "embedded", dict.fromkeys(datasets, FAMILIES), hands, folders).read_text(encoding="utf-8")
 
 
-def test_report_tells_what_is_in_each_dataset_and_what_was_left_out(folders, hands, tmp_path):
+def test_report_shows_each_dataset_and_skipped_sequences(folders, hands, tmp_path):
     text = write(folders, hands, tmp_path / "report", "grab", "arctic")
     assert "<td>arctic is not present</td>" in text
-    assert text.index("Held-out figures") < text.index("arctic is not present")
+    assert text.index("Metrics of all methods") < text.index("arctic is not present")
     assert "NaN in &lt;frame 3&gt;" in text
     assert "<b>3</b><span>clips</span>" in text
     assert "SYNTHETIC" in text
@@ -66,16 +68,16 @@ def test_report_tells_what_is_in_each_dataset_and_what_was_left_out(folders, han
     assert text.count("<svg") == 1
 
 
-def test_a_split_without_validation_clips_is_said_beside_the_figures_and_after_a_run(folders, hands, tmp_path):
+def test_a_split_without_validation_clips_is_reported_with_the_metrics_and_after_a_run(folders, hands, tmp_path):
     words = "no validation clips: no threshold, seed or stopping point is chosen; the last weights are kept"
     text = write(folders, hands, tmp_path / "report", "grab")
-    assert text.index("Held-out figures") < text.index(f"The split has {words}.") < text.index("What is in it")
+    assert text.index("Metrics of all methods") < text.index(f"The split has {words}.") < text.index("<h3>Counts</h3>")
     (tmp_path / "params.yaml").write_text("profile: embedded\ndatasets: [grab]\nfamilies: [ground-truth]\n")
     assert f"grab: {words}." in describe_results(tmp_path, "embedded").splitlines()
 
 
 @pytest.mark.slow
-def test_recorded_and_generated_motion_and_contact_maps_stand_side_by_side(sampled, hands, tmp_path):
+def test_recorded_and_generated_motion_and_contact_maps_are_shown_together(sampled, hands, tmp_path):
     first, second = (write(sampled, hands, tmp_path / name, "grab") for name in "ab")
     assert first == second
     assert first.count('<script type="application/octet-stream" class="glb">') == 4
@@ -84,13 +86,13 @@ def test_recorded_and_generated_motion_and_contact_maps_stand_side_by_side(sampl
     assert "24 motions of 12 clips" in first
 
 
-def test_dataset_of_which_nothing_could_be_used_still_lists_why(folders, hands, tmp_path):
-    left_out = Quarantined("test/s1/mug", "s1/mug.npz", "finite numbers", "NaN", "download it again")
+def test_dataset_without_usable_sequences_lists_the_reasons(folders, hands, tmp_path):
+    left_out = Quarantined("test/s1/mug", "s1/mug.npz", "finite numbers", "NaN", remedy="download it again")
     write_clips(folders.data / "h2o" / "clips", [left_out], "h2o")
     text = write(folders, hands, tmp_path / "report", "h2o")
     assert "Empty: no sequence gave a clip." in text
     assert "<td>finite numbers</td>" in text
-    assert "Held-out figures" not in text
+    assert "Metrics of all methods" not in text
 
 
 def test_report_repeats_byte_for_byte_and_fetches_nothing(folders, hands, tmp_path):
@@ -133,7 +135,7 @@ def test_a_leading_metric_that_was_not_measured_is_named_with_its_reason_apart_f
     without = {"deep_share": {"the object has no inside": 257}, "slip_cm_s": {"no such frame": 3}}
     (metrics / "ours.json").write_text(json.dumps({"figures": figures, "unmeasured": without}))
     (metrics / "whole.json").write_text(json.dumps({"figures": figures}))
-    write_figures(out, tmp_path / "metrics", tmp_path / "checkpoints", {"arctic": ["ours", "whole"]})
+    write_dvc_metrics(out, tmp_path / "metrics", tmp_path / "checkpoints", {"arctic": ["ours", "whole"]})
     assert json.loads((out / "figures.json").read_text()) == {
         "arctic": {"ours": figures, "whole": figures},
         "not measured": {"arctic": {"ours": {"deep_share": "the object has no inside: 257 clips"}}},
