@@ -30,7 +30,7 @@ from hoidata.clips.features import HAND_FEATURES
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import TIP_VERTICES
 from hoidata.objects.model import articulate
-from hoidata.refinement import GeneratedHand, fit_hands
+from hoidata.refinement import GeneratedKeypoints, fit_hands
 from hoidata.sensors.keypoints import hand_keypoints
 from hoidata.sensors.part_bps import BasisSettings
 from models.bimart.family import clip_without_hands, world_from_canonical
@@ -39,7 +39,7 @@ from models.bimart.retrieval import canonical_hands, moved_hands, scene_features
 from models.bimart.scene import Scene, hand_vertices_m
 from models.bimart.training import Moments
 from models.common.checkpoints import load_checkpoint
-from models.common.family import Family, LeftOut, Losses, Network, Setup, Sources, motion_clip, refuse_not_finite
+from models.common.family import Family, Losses, Network, Setup, Skipped, Sources, motion_clip, refuse_not_finite
 from models.common.features import proper_hands
 from models.common.losses import masked_mean
 from models.common.sampling import TRAIN_STEPS, SamplerConfig, add_noise, alphas_cumprod, sample
@@ -263,12 +263,12 @@ class PoseSampler:
         trained = [load_checkpoint(sources.checkpoints / network.name, network, sources.device) for network in networks]
         return cls([cast(PoseNetwork, network.network) for network in trained], bool(trained[0].facts["synthetic"]))
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
+    def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
         return [self._answer(request) for request in requests]
 
-    def _answer(self, request: Request) -> Clip | LeftOut:
+    def _answer(self, request: Request) -> Clip | Skipped:
         if request.trajectories is None:
-            return LeftOut(request.motion_id, NO_OBJECT_MOTION)
+            return Skipped(request.motion_id, NO_OBJECT_MOTION)
         motion = request.trajectories.object[: request.n_frames]
         scene = Scene.of(request.object, motion, BASIS)
         condition = condition_of(scene, request.active_hands)
@@ -423,12 +423,12 @@ class CamsSampler:
         trained = load_checkpoint(sources.checkpoints / CAMS.name, CAMS, sources.device)
         return cls(cast(CamsNetwork, trained.network), sources, bool(trained.facts["synthetic"]))
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
+    def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
         return [self._answer(request) for request in requests]
 
-    def _answer(self, request: Request) -> Clip | LeftOut:
+    def _answer(self, request: Request) -> Clip | Skipped:
         if request.trajectories is None or not request.clip_id:
-            return LeftOut(request.motion_id, NO_OBJECT_MOTION)
+            return Skipped(request.motion_id, NO_OBJECT_MOTION)
         recorded, pair = load_sample(self.sources.annotated, request.clip_id), self.sources.hands
         clip = canonical_clip(recorded)
         stages = stages_of(clip.joints_m, clip.scene)
@@ -441,7 +441,7 @@ class CamsSampler:
             points_m = carried_keypoints(skin_m[ids], tips, fingers[:, side_index], stages, clip.scene, side_index)
             refuse_not_finite(request, points_m)
             everywhere = np.ones(len(points_m), bool)
-            generated[SIDES[side_index]] = GeneratedHand(world @ points_m, np.zeros_like(points_m), everywhere)
+            generated[SIDES[side_index]] = GeneratedKeypoints(world @ points_m, np.zeros_like(points_m), everywhere)
         bare = clip_without_hands(request, self.synthetic)
         tracks = fit_hands(pair, request.betas, ids, generated, request.template_m)
         return replace(bare, hands={**bare.hands, **tracks})

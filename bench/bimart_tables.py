@@ -21,7 +21,7 @@ from bench.harness import show
 from hoidata.files.written import read_json
 from hoidata.hands import HandPair
 from hoidata.metrics.evaluate import evaluate_store
-from hoidata.metrics.optional_metrics import with_lists
+from hoidata.metrics.optional_metrics import select_metrics
 from hoidata.settings import build_config
 from models.common.checkpoints import FILE_NAME
 from models.common.family import Family, Network
@@ -109,7 +109,7 @@ class Run:
         )
         if not counts["clips"]:
             return read_json(folder / "empty.json")
-        return evaluate_store(folder / "clips", self.data, self.hands, metrics=with_lists(["bimart"]))
+        return evaluate_store(folder / "clips", self.data, self.hands, metrics=select_metrics(["bimart"]))
 
     def _train(self, network: Network, folder: Path, preset: str) -> None:
         if (folder / network.name / FILE_NAME).is_file():

@@ -35,17 +35,17 @@ class BadInput(HoidataError):
         return type(self), (self.where, self.expected, self.got, self.remedy)
 
 
-class ChangedMeanwhile(BadInput):
+class RawFileChanged(BadInput):
     """A raw file differs from the manifest because the raw folder changed during a run."""
 
 
-class MachineTrouble(HoidataError):
+class MachineError(HoidataError):
     """The machine failed, not the input: disk full or read-only, I/O error, too little memory."""
 
 
 @contextmanager
-def told_in_words() -> Iterator[None]:
-    """Raise MachineTrouble with a remedy for a full or read-only disk, an I/O error, or too little memory."""
+def explain_machine_errors() -> Iterator[None]:
+    """Raise MachineError with a remedy for a full or read-only disk, an I/O error, or too little memory."""
     try:
         yield
     except HoidataError:
@@ -53,7 +53,7 @@ def told_in_words() -> Iterator[None]:
     except Exception as error:
         if isinstance(error, BrokenPipeError) or not (message := _machine_message(error)):
             raise
-        raise MachineTrouble(message) from error
+        raise MachineError(message) from error
 
 
 def _machine_message(error: Exception) -> str:

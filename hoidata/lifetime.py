@@ -45,7 +45,7 @@ def end_with_starter() -> None:
     _end_after(starter.join)
 
 
-def begin_worker() -> None:
+def init_worker() -> None:
     """Initialise a worker process: it ends with its parent and ignores Ctrl-C, which the parent handles."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
@@ -53,7 +53,7 @@ def begin_worker() -> None:
 
 
 @contextmanager
-def ctrl_c_blocked() -> Iterator[None]:
+def block_ctrl_c() -> Iterator[None]:
     """Block Ctrl-C in ``multiprocessing`` processes that are started inside, until they unblock it.
 
     In a terminal Ctrl-C reaches all processes of a command, and a starting interpreter would print a traceback. This

@@ -12,7 +12,7 @@ _PORTABLE_KERNELS = {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES":
 _CPUINFO = Path("/proc/cpuinfo")
 
 
-def same_kernels() -> dict[str, str]:
+def portable_kernels() -> dict[str, str]:
     """Environment variables for equal kernels; empty without AVX2 or if the processor is unknown."""
     has_avx2 = platform.machine() == "x86_64" and "avx2" in _cpuinfo("flags").split()
     return dict(_PORTABLE_KERNELS) if has_avx2 else {}

@@ -70,7 +70,7 @@ def build_config(kind: type[Config], values: Mapping[str, Any] | None, source: s
     """
     values = _checked_mapping({} if values is None else values, source)
     by_name: dict[str, Field] = {item.name: item for item in fields(kind)}  # pyright: ignore[reportArgumentType]
-    refuse_unknown(values, list(by_name), source)
+    check_keys(values, list(by_name), source)
     required = [name for name, item in by_name.items() if item.default is MISSING and item.default_factory is MISSING]
     if missing := [name for name in required if name not in values]:
         raise BadInput(source, f"a value for {', '.join(missing)}", "none", "give one")
@@ -87,22 +87,22 @@ def build_config(kind: type[Config], values: Mapping[str, Any] | None, source: s
         raise BadInput(full_key, error.expected, error.got, error.remedy) from error
 
 
-def as_section(values: Mapping[str, Any], prefix: str) -> Section:
+def to_section(values: Mapping[str, Any], prefix: str) -> Section:
     """Convert nested mappings to sections; ``prefix`` precedes their keys in the file."""
     section = Section(
-        (name, as_section(value, f"{prefix}{name}.") if isinstance(value, dict) else value)
+        (name, to_section(value, f"{prefix}{name}.") if isinstance(value, dict) else value)
         for name, value in values.items()
     )
     section.keys_in_file = {name: f"{prefix}{name}" for name in values}
     return section
 
 
-def laid_over(base: Mapping[str, Any], overlay: Mapping[str, Any]) -> Section:
+def merge_settings(base: Mapping[str, Any], overlay: Mapping[str, Any]) -> Section:
     """Merge ``overlay`` into ``base``: mappings are merged, other values replaced; entries keep their full key."""
 
     def merged(name: str, value: Any) -> Any:
         both = isinstance(base.get(name), dict) and isinstance(value, dict)
-        return laid_over(base[name], value) if both else value
+        return merge_settings(base[name], value) if both else value
 
     section = Section({**base, **{name: merged(name, value) for name, value in overlay.items()}})
     section.keys_in_file = {**_keys_in_file(base), **_keys_in_file(overlay)}
@@ -118,13 +118,13 @@ def _keys_in_file(values: Mapping[str, Any]) -> Mapping[str, str]:
     return values.keys_in_file if isinstance(values, Section) else {}
 
 
-def at_least(source: str, config: Any, name: str, least: float) -> None:
+def require_at_least(source: str, config: Any, name: str, least: float) -> None:
     """Raise BadInput if the setting ``name`` of ``config`` is less than ``least``."""
     if getattr(config, name) < least:
         raise BadInput(f"{source}.{name}", f"{least} or more", str(getattr(config, name)), "correct params.yaml")
 
 
-def refuse_unknown(values: Mapping[str, Any], allowed: Sequence[str], source: str) -> None:
+def check_keys(values: Mapping[str, Any], allowed: Sequence[str], source: str) -> None:
     """Raise BadInput with the keys that are not allowed and those that are."""
     if unknown := [str(name) for name in values if name not in allowed]:
         section = key_in_file(values, unknown[0], source).removesuffix(f".{unknown[0]}")
@@ -165,9 +165,9 @@ def _mapping(hint: Any, value: Any, source: str, item: Field | None) -> dict[str
     default = item.default_factory() if item and item.default_factory is not MISSING else {}
     if not is_dataclass(hint):
         return {**default, **value}
-    refuse_unknown(value, list(default), source)
+    check_keys(value, list(default), source)
     entries = {name: _checked_mapping(entry, f"{source}.{name}") for name, entry in value.items()}
-    merged = {name: laid_over(asdict(default[name]), entry) for name, entry in entries.items()}
+    merged = {name: merge_settings(asdict(default[name]), entry) for name, entry in entries.items()}
     return {**default, **{name: _value(hint, entry, f"{source}.{name}") for name, entry in merged.items()}}
 
 

@@ -23,7 +23,7 @@ from multiprocessing.context import SpawnProcess
 from typing import Any
 
 from hoidata.errors import BadInput, HoidataError, MissingResource
-from hoidata.lifetime import begin_worker, ctrl_c_blocked
+from hoidata.lifetime import block_ctrl_c, init_worker
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 LOCAL, DASK = "local", "dask"
@@ -32,7 +32,7 @@ PATIENCE_S = 30
 _chosen = [LOCAL]
 
 
-class WorkerLost(BadInput):
+class WorkerDied(BadInput):
     """An item whose worker process died twice, the second time without other workers. cause: why the process ended."""
 
     def __init__(self, item: Any, cause: str) -> None:
@@ -62,8 +62,8 @@ class _Worker:
 Function = Callable[[Any], Any]
 
 
-def in_workers(
-    function: Function, items: Sequence[Any], jobs: int, lock: int = -1, on_lost: Function | None = None
+def map_in_workers(
+    function: Function, items: Sequence[Any], jobs: int, lock: int = -1, on_worker_died: Function | None = None
 ) -> Iterator[tuple[Any, Any]]:
     """Yield each item with the function's result, in no fixed order; exceptions of the function are raised.
 
@@ -74,11 +74,11 @@ def in_workers(
         items: the items.
         jobs: number of new processes, each with one thread; 1 works in this process.
         lock: a file descriptor that each worker keeps open until it ends; -1 for none.
-        on_lost: result of an item whose worker died twice, from its WorkerLost. By default the WorkerLost is raised
+        on_worker_died: result of an item whose worker died twice, from its WorkerDied. By default the error is raised
             after all other items.
     """
-    if is_used_for(jobs) and len(items) > 1:
-        yield from _on_cluster(function, items, jobs, on_lost)
+    if uses_cluster(jobs) and len(items) > 1:
+        yield from _on_cluster(function, items, jobs, on_worker_died)
         return
     if jobs <= 1:
         with one_thread():
@@ -93,17 +93,17 @@ def in_workers(
     for item in lost:  # without other workers: it may need all memory
         for _, result in _distributed(function, [item], 1, lock):
             died = isinstance(result, _Died)
-            yield item, _result_of_lost(on_lost, WorkerLost(item, result.cause)) if died else result
+            yield item, _result_of_lost(on_worker_died, WorkerDied(item, result.cause)) if died else result
 
 
-def _result_of_lost(on_lost: Function | None, error: WorkerLost) -> Any:
-    if on_lost is None:
+def _result_of_lost(on_worker_died: Function | None, error: WorkerDied) -> Any:
+    if on_worker_died is None:
         raise error
-    return on_lost(error)
+    return on_worker_died(error)
 
 
 def in_order(pairs: Iterator[tuple[Any, Any]], items: Sequence[Any]) -> Iterator[tuple[Any, Any]]:
-    """Sort the pairs of ``in_workers`` into the order of the items; early results are buffered."""
+    """Sort the pairs of ``map_in_workers`` into the order of the items; early results are buffered."""
     early: dict[Any, Any] = {}
     for item in items:
         while item not in early:
@@ -161,7 +161,7 @@ def _start(function: Function, lock: int) -> _Worker:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs, _Descriptor(lock)), daemon=True)
-    with ctrl_c_blocked():
+    with block_ctrl_c():
         process.start()
     theirs.close()
     # Not among the arguments: if the process dies before it reads more than a pipe buffers, start() would block.
@@ -220,7 +220,7 @@ def _received(copy: Any) -> _Descriptor:
 def _serve(connection: Connection, lock: _Descriptor) -> None:
     """Main loop of a worker process. ``lock`` is a descriptor that stays open until the process ends."""
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # read by libraries that the function loads later
-    begin_worker()
+    init_worker()
     try:
         function = connection.recv()
     except EOFError:  # the parent is gone
@@ -268,15 +268,15 @@ def choose_workers(backend: str) -> None:
     _chosen[0] = backend
 
 
-def is_used_for(jobs: int) -> bool:
+def uses_cluster(jobs: int) -> bool:
     """Whether work for ``jobs`` workers goes to a cluster; a new cluster is not started for a single worker."""
     return _chosen[0] not in (LOCAL, DASK) or (_chosen[0] == DASK and jobs > 1)
 
 
 def _on_cluster(
-    function: Function, items: Sequence[Any], jobs: int, on_lost: Function | None
+    function: Function, items: Sequence[Any], jobs: int, on_worker_died: Function | None
 ) -> Iterator[tuple[Any, Any]]:
-    """``in_workers`` on the chosen cluster. jobs: number of workers of a cluster started here.
+    """``map_in_workers`` on the chosen cluster. jobs: number of workers of a cluster started here.
 
     The chunk of a dead worker is repeated by others. A chunk that ends several workers is split into single items.
     """
@@ -299,8 +299,8 @@ def _on_cluster(
                     results = future.result()
                 except KilledWorker:  # also for a finished chunk whose worker died with the result
                     if len(chunk) == 1:
-                        error = WorkerLost(chunk[0], "several workers ended with it")
-                        yield chunk[0], _result_of_lost(on_lost, error)
+                        error = WorkerDied(chunk[0], "several workers ended with it")
+                        yield chunk[0], _result_of_lost(on_worker_died, error)
                     else:
                         running |= {submitted([item]): [item] for item in chunk}
                     continue

@@ -18,15 +18,15 @@ from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import load_checkpoint
 from models.common.repeatable import make_repeatable
 from models.manipnet.animate import (
+    AnimationInput,
     Gap,
-    Given,
     at_30_fps,
-    clip_control,
     clip_of,
+    control_from_clip,
+    control_from_file,
     gap_of,
-    given_control,
-    new_fingers,
-    straight_fingers,
+    interpolate_fingers,
+    predict_fingers,
     with_fingers,
 )
 from models.manipnet.control import hands_of
@@ -38,7 +38,7 @@ from pipelines.command_inputs import MeshOptions, ProjectData, stored_object, tr
 from pipelines.pages.motion_files import ARRAYS as SHARED
 from pipelines.pages.motion_files import MotionFiles, hand_shapes, motion_arrays, simplified_for_page, write_motions
 from pipelines.pages.player import motion_player
-from pipelines.showing import find_clip
+from pipelines.show_pages import dataset_of_clip
 from pipelines.stages.base import StagePaths, load_hands
 
 Method = Literal["auto", "network", "interpolate"]
@@ -162,13 +162,13 @@ def _from_clip(clip_id: str, options: AnimationOptions, project: ProjectData) ->
     if interpolated != sides:
         datasets = (paths.dataset, *project.datasets)  # the networks of the clip's dataset come first
         network = chosen_network(options, project._replace(datasets=datasets))
-    control, person_hands, tracks = clip_control(clip), hands_of(hands, *hand_shapes(clip)), dict(clip.hands)
+    control, person_hands, tracks = control_from_clip(clip), hands_of(hands, *hand_shapes(clip)), dict(clip.hands)
     generated = np.zeros((2, clip.n_frames), bool)
     for side, gap in gaps.items():
         if network is None or side in interpolated:
-            fingers = straight_fingers(gap)
+            fingers = interpolate_fingers(gap)
         else:
-            fingers = new_fingers(network.predictor, person_hands[side], side, control, gap)
+            fingers = predict_fingers(network.predictor, person_hands[side], side, control, gap)
         # A gap includes the untracked frames around the requested ones.
         requested = fingers[frames.start - gap.first : frames.stop - gap.first]
         tracks[side] = with_fingers(clip.hands[side], frames, requested, control.wrists[side])
@@ -187,7 +187,7 @@ def _from_clip(clip_id: str, options: AnimationOptions, project: ProjectData) ->
 def _clip_paths(clip_id: str, project: ProjectData) -> StagePaths:
     """The paths of the clip's dataset. Raises BadInput for an unknown id; a name with a suffix counts as a file."""
     try:
-        return find_clip(clip_id, project.profile, list(project.datasets))
+        return dataset_of_clip(clip_id, project.profile, list(project.datasets))
     except (BadInput, MissingResource) as error:
         if not Path(clip_id).suffix:
             raise
@@ -229,7 +229,7 @@ def _from_file(path: Path, options: AnimationOptions, project: ProjectData) -> A
     network = chosen_network(options, project)
     model, notes = _object(options, options.mesh.unit or trajectories.mesh_unit, project)
     mean_hands = hands_of(project.hands, np.zeros((2, 10), np.float32), None)
-    given = given_control(trajectories, model, mean_hands)
+    given = control_from_file(trajectories, model, mean_hands)
     notes += [*given.notes, *_skipped_hand_notes(trajectories, given, options.sides)]
     control = at_30_fps(given.control)
     n_frames = len(control.object_motion.time_s)
@@ -238,13 +238,13 @@ def _from_file(path: Path, options: AnimationOptions, project: ProjectData) -> A
         fingers[side] = np.tile(mean_hands[side].rest_rotmats, (n_frames, 1, 1, 1))
         if side in given.active and side in options.sides:
             gap = Gap(0, n_frames, None, None)
-            fingers[side] = new_fingers(network.predictor, mean_hands[side], side, control, gap)
+            fingers[side] = predict_fingers(network.predictor, mean_hands[side], side, control, gap)
             generated[SIDES.index(side)] = True
     clip = clip_of(control, fingers, trajectories.up or UPS[options.up], path.stem, network.is_synthetic)
     return Animation(clip, generated, {}, project.hands, facts=[*network.rows, ("object", model.name)], notes=notes)
 
 
-def _skipped_hand_notes(trajectories: TrajectoryFile, given: Given, sides: tuple[Side, ...]) -> list[str]:
+def _skipped_hand_notes(trajectories: TrajectoryFile, given: AnimationInput, sides: tuple[Side, ...]) -> list[str]:
     """A note per hand near the object that was not requested. Raises BadInput if no requested hand is near it."""
     if not set(given.active) & set(sides):
         present = f"{trajectories.source} has {' and '.join(trajectories.wrists)}"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from hoidata.errors import HoidataError, told_in_words
+from hoidata.errors import HoidataError, explain_machine_errors
 from pipelines.commands import (
     adapters,
     compare,
@@ -70,7 +70,7 @@ def main() -> None:
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # file names may have bytes that are not UTF-8
     try:
-        with told_in_words():
+        with explain_machine_errors():
             app()
     except HoidataError as error:
         from rich.console import Console

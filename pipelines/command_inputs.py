@@ -59,7 +59,7 @@ def nearest_name(name: str, names: Sequence[str]) -> str:
 def mesh_notes(model: ObjectModel) -> list[str]:
     """Notes on repairs of a mesh, and on parts without an inside, where penetration is not prevented."""
     index = surface_index(model)
-    note = [] if index.solid_note is None else [f"mesh: {index.solid_note}"]
+    note = [] if index.repair_note is None else [f"mesh: {index.repair_note}"]
     return (
         note if index.is_solid else [f"{note[0]}; hands are attracted to its surface, but penetration is not prevented"]
     )

@@ -68,7 +68,7 @@ EXPECTED_ORDERINGS: tuple[ExpectedOrdering, ...] = (
     *_orderings("fall", "other-verb", *ACCURACY, "r_precision_top1_text_motion"),
     *_orderings("be zero", "mean-pose", "multimodality_by_prompt_corrected"),
     *_orderings("fall", "mean-pose", "diversity_corrected"),
-    *_orderings("rise", "prompt-lookup", "memorised_share_path"),
+    *_orderings("rise", "prompt-retrieval", "memorised_share_path"),
     *_orderings("fall", "other-prompt", "accuracy_top1_corrected", reference="text2hoi"),
     *_orderings("fall", "other-contact", "adherence", reference="text2hoi"),
     *_orderings("fall", "hands-still", *CONTACT),

@@ -19,11 +19,11 @@ from prefect.states import Crashed
 from hoidata.errors import BadInput
 from pipelines.commands.project import current_profile, set_profile
 from pipelines.lineage.graph import Stage, read_graph
+from pipelines.parallel_repro import RunStage, describe_run, log_of
 from pipelines.params import PROFILES, read_params
 from pipelines.prefect_server import KEY_FILE
 from pipelines.repro import reproduce
 from pipelines.run_facts import describe_results
-from pipelines.side_by_side import RunStage, describe_run, log_of
 
 # DVC's message for a stage that the system killed, most often for lack of memory. Such a stage is tried again.
 KILLED = "exited with -9"

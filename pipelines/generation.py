@@ -21,7 +21,7 @@ from models.common.checkpoints import FILE_NAME, read_info
 from models.common.repeatable import make_repeatable
 from models.common.vocabulary import Vocabulary
 from models.text2hoi.family import NAMES
-from models.text2hoi.generation import GeneratedMotion, Generator, Wish
+from models.text2hoi.generation import GeneratedMotion, Generator, MotionOptions
 from models.text2hoi.sampler import SamplingConfig
 from models.text2hoi.sentences import further_verbs, read_sentence
 from models.text2hoi.wording import Wording, understood_words
@@ -53,7 +53,7 @@ class GenerationRequest:
     datasets: tuple[str, ...] = ()
     model: str = ""  # the dataset whose models to use; "" chooses it by the words of the sentence
     models: Models | None = None  # used instead of the project's models
-    wish: Wish = field(default_factory=Wish)
+    wish: MotionOptions = field(default_factory=MotionOptions)
     mesh: MeshOptions = field(default_factory=MeshOptions)
     sampler: Mapping[str, Any] = field(default_factory=dict)  # fields of SamplerConfig that replace the models' own
     force: bool = False  # generate even if the sentence has unknown words, and keep those words

@@ -22,8 +22,8 @@ from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import Store, open_store
-from models.bimart.family import BIMART, HandsForPaths
-from models.bimart.hands import MadeHands, MotionWish, hands_for
+from models.bimart.family import BIMART, BimArtSampler
+from models.bimart.hands import HandSamplingOptions, SampledHands, hands_for
 from models.common.checkpoints import FILE_NAME, read_info
 from models.common.family import Sources
 from models.common.repeatable import make_repeatable
@@ -39,7 +39,7 @@ from pipelines.command_inputs import (
 )
 from pipelines.pages.hands_page import write_hands
 from pipelines.pages.motion_files import hand_shapes
-from pipelines.showing import find_clip
+from pipelines.show_pages import dataset_of_clip
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
 
 MIN_LENGTH_S = 0.3
@@ -69,7 +69,7 @@ class ObjectMotion(NamedTuple):
     """An object motion for which to generate hands."""
 
     track: ObjectTrack
-    wish: MotionWish
+    wish: HandSamplingOptions
     steps: tuple[PathStep, ...]  # of a path from keyframes
     source: str  # in words
     notes: list[str]
@@ -102,7 +102,7 @@ def object_motion(options: HandsOptions, project: ProjectData) -> ObjectMotion:
     if len(sources) != 1:
         got = " and ".join(f"--{name}" for name in sources) or "none"
         raise BadInput("object's motion", "one of --keyframes, --clip or --motion", got, "give one of them")
-    wish = MotionWish(options.seed, options.samples, options.hand)
+    wish = HandSamplingOptions(options.seed, options.samples, options.hand)
     if options.clip:
         motion = _clip_motion(options, project, wish)
     elif options.motion:
@@ -120,15 +120,15 @@ def object_motion(options: HandsOptions, project: ProjectData) -> ObjectMotion:
     return motion
 
 
-def chosen_networks(model: str, project: ProjectData) -> tuple[StagePaths, HandsForPaths]:
+def chosen_networks(model: str, project: ProjectData) -> tuple[StagePaths, BimArtSampler]:
     """The networks of the requested dataset, or of the first that has them. Raises MissingResource if none has."""
     paths, _ = trained_run("bimart", BIMART.uses, model, project)
     annotated = load_annotated(paths.data, project.hands)
     sources = Sources(annotated, paths.checkpoints, project.hands, torch.device("cpu"))
-    return paths, HandsForPaths.load(sources)
+    return paths, BimArtSampler.load(sources)
 
 
-def _notes(samples: list[MadeHands]) -> list[str]:
+def _notes(samples: list[SampledHands]) -> list[str]:
     """Notes on the mesh (open, repaired), and on hands that never touch the object."""
     notes = mesh_notes(samples[0].clip.object.model)
     for sample in samples:
@@ -203,7 +203,7 @@ def hinge_range(text: str) -> tuple[float, float]:
     return float(np.radians(low_deg)), float(np.radians(high_deg))
 
 
-def _keyframed_motion(options: HandsOptions, project: ProjectData, wish: MotionWish) -> ObjectMotion:
+def _keyframed_motion(options: HandsOptions, project: ProjectData, wish: HandSamplingOptions) -> ObjectMotion:
     movable = _object(options, project)
     keys = read_keyframes(options.keyframes)
     path = keyframed_path(movable.model, keys, movable.hinge_limits_rad, options.keyframes, movable.rest_rotation)
@@ -211,11 +211,11 @@ def _keyframed_motion(options: HandsOptions, project: ProjectData, wish: MotionW
     return ObjectMotion(path.track, wish, steps=path.steps, source=source, notes=movable.notes)
 
 
-def _clip_motion(options: HandsOptions, project: ProjectData, wish: MotionWish) -> ObjectMotion:
+def _clip_motion(options: HandsOptions, project: ProjectData, wish: HandSamplingOptions) -> ObjectMotion:
     """The object motion of a stored clip, with the hand shapes of its subject."""
     if options.object:
         raise BadInput("object", "no object with --clip, which has one", options.object, "omit it")
-    paths = find_clip(options.clip, project.profile, list(project.datasets))
+    paths = dataset_of_clip(options.clip, project.profile, list(project.datasets))
     clip = open_store(paths.clips, project.hands).clip(options.clip)
     betas, template_m = hand_shapes(clip)
     notes = [] if clip.gravity is not None else ["up: z, assumed: the gravity of this clip is not known"]
@@ -224,7 +224,7 @@ def _clip_motion(options: HandsOptions, project: ProjectData, wish: MotionWish) 
     return ObjectMotion(clip.object, wish, steps=(), source=f"clip {options.clip}", notes=notes)
 
 
-def _generated_motion(options: HandsOptions, project: ProjectData, wish: MotionWish) -> ObjectMotion:
+def _generated_motion(options: HandsOptions, project: ProjectData, wish: HandSamplingOptions) -> ObjectMotion:
     """The object motion in a motion.npz of ``hoidata generate``, with its mesh or with the object of the options."""
     path = Path(options.motion)
     if not path.is_file():

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from hoidata.errors import BadInput
-from hoidata.settings import Section, as_section, laid_over, refuse_unknown
+from hoidata.settings import Section, check_keys, merge_settings, to_section
 
 # embedded and study are generated corpora; own has the user's files.
 PROFILES = ("embedded", "study", "own")
@@ -64,14 +64,16 @@ def chosen_params(values: dict[str, Any]) -> Section:
     """
     sections = {name: value for name, value in values.items() if name != "profiles"}
     overlays = _mapping(values.get("profiles"), "params.yaml: profiles")
-    refuse_unknown(overlays, PROFILES, "params.yaml: profiles")
+    check_keys(overlays, PROFILES, "params.yaml: profiles")
     for profile, overlay in overlays.items():
         _check_overlay(
             _mapping(overlay, f"params.yaml: profiles.{profile}"), sections, f"params.yaml: profiles.{profile}"
         )
     chosen = _mapping(overlays.get(str(values.get("profile"))), "params.yaml: profiles")
     overlay_values = {name: value for name, value in chosen.items() if value is not None}
-    return laid_over(as_section(sections, KEYS), as_section(overlay_values, f"{KEYS}profiles.{values.get('profile')}."))
+    return merge_settings(
+        to_section(sections, KEYS), to_section(overlay_values, f"{KEYS}profiles.{values.get('profile')}.")
+    )
 
 
 def _check_overlay(overlay: dict[str, Any], sections: dict[str, Any], path: str) -> None:
@@ -80,7 +82,7 @@ def _check_overlay(overlay: dict[str, Any], sections: dict[str, Any], path: str)
         if section in overlay and (not name or name in _mapping(overlay[section], f"{path}.{section}")):
             remedy = "set it at the top of params.yaml, for all profiles"
             raise BadInput(f"{path}.{key}", "settings of a stage", "a key that dvc.yaml uses", remedy)
-    refuse_unknown(overlay, [name for name in sections if name not in TEMPLATED], path)
+    check_keys(overlay, [name for name in sections if name not in TEMPLATED], path)
     for name, value in overlay.items():
         if isinstance(sections[name], dict):
             _mapping(value, f"{path}.{name}")

@@ -8,8 +8,8 @@ from pathlib import Path
 from hoidata.errors import BadInput, MissingResource
 from pipelines.lineage.graph import look_up, read_graph, written_graph
 from pipelines.lineage.manifests import read_manifest
+from pipelines.parallel_repro import Run, RunStage, reproduce_in_parallel
 from pipelines.params import read_file, read_params
-from pipelines.side_by_side import Run, RunStage, reproduce_side_by_side
 from pipelines.stages.adapters import ensure_manifests, raw_files
 from pipelines.stages.base import StagePaths
 from pipelines.stages.code import write_code
@@ -26,15 +26,15 @@ def reproduce(
     Args:
         targets: DVC targets; empty for all.
         jobs: number of parallel stages; 0: one per core, at most 4.
-        wrap: see ``reproduce_side_by_side``.
-        force: see ``reproduce_side_by_side``.
+        wrap: see ``reproduce_in_parallel``.
+        force: see ``reproduce_in_parallel``.
 
     Raises:
         MissingResource: raw or MANO files that a stale stage needs are missing.
     """
     preflight()
     os.environ.update(stage_environment())
-    return reproduce_side_by_side(targets, jobs or min(MAX_JOBS, len(os.sched_getaffinity(0))), wrap, force)
+    return reproduce_in_parallel(targets, jobs or min(MAX_JOBS, len(os.sched_getaffinity(0))), wrap, force)
 
 
 def stage_environment() -> dict[str, str]:

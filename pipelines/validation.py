@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from hoidata.errors import BadInput, MissingResource
-from hoidata.files.sealed import seal_fault
+from hoidata.files.checksums import corrupted_part
 from hoidata.files.written import REMEDY
 from pipelines.lineage.locks import Locked, other_files, read_locks
 from pipelines.stages.base import empty_reason
@@ -44,7 +44,7 @@ def _changed_files(root: Path, lock: Locked, out: str, path: Path) -> list[BadIn
 
 def _broken_seal(file: Path) -> BadInput | None:
     try:
-        fault = seal_fault(file)
+        fault = corrupted_part(file)
     except BadInput as error:
         return error
     return BadInput(file, f"the {fault} it was written with, by its own digest", "others", REMEDY) if fault else None

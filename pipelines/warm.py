@@ -25,7 +25,7 @@ from typing import Any
 
 from hoidata.lifetime import end_on_signals
 from hoidata.package_paths import python_path
-from hoidata.processor import same_kernels
+from hoidata.processor import portable_kernels
 
 SOCKET = "HOIDATA_WARM"
 PRELOADED = (
@@ -34,7 +34,7 @@ PRELOADED = (
 )  # fmt: skip
 # Libraries read these on import. Idle OpenMP threads must sleep: spinning ones cost ten times as much on a busy
 # machine. BLAS gets one thread: for small matrices two take five times as long, and change the last bits.
-ENVIRONMENT = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "0", "OPENBLAS_NUM_THREADS": "1", **same_kernels()}
+ENVIRONMENT = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "0", "OPENBLAS_NUM_THREADS": "1", **portable_kernels()}
 ACCEPTED = b"t"
 KILLED = 128 + signal.SIGKILL
 FORWARDED = (signal.SIGINT, signal.SIGTERM)

@@ -20,9 +20,9 @@ from PIL import Image
 from websockets.asyncio.client import ClientConnection, connect
 
 from hoidata.hands import load_embedded_hands
-from models.text2hoi.generation import Wish
+from models.text2hoi.generation import MotionOptions
 from pipelines.generation import GenerationRequest, generate_files
-from pipelines.showing import write_shown_of
+from pipelines.show_pages import write_page_from
 
 IMAGES = Path(__file__).parents[1] / "images"
 PORT = 9333
@@ -75,7 +75,7 @@ async def take(project: Path, folder: Path) -> None:
     address = next(tab for tab in _tabs() if tab["type"] == "page")["webSocketDebuggerUrl"]
     async with connect(address, max_size=None) as socket:
         page = Page(socket)
-        shown = write_shown_of(project / MOTION, CLIP, load_embedded_hands(), folder)
+        shown = write_page_from(project / MOTION, CLIP, load_embedded_hands(), folder)
         await page.open(shown, 520, 700, 1)
         box = json.loads(await page.run(CANVAS))
         area = {name: box[name] for name in ("x", "y", "width", "height")}
@@ -95,7 +95,7 @@ async def take(project: Path, folder: Path) -> None:
 def generated(project: Path, folder: Path) -> Path:
     """Generate two motions for a sentence in the project, and return the path of their page."""
     chdir(project)
-    request = GenerationRequest(SENTENCE, "mug", "embedded", ("grab",), wish=Wish(seed=1, samples=2))
+    request = GenerationRequest(SENTENCE, "mug", "embedded", ("grab",), wish=MotionOptions(seed=1, samples=2))
     return generate_files(request, folder / "generated").paths[-1]
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from hoidata.clips.clip import FPS, SIDES, ObjectTrack
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import runs
-from hoidata.geometry.rotations import turns_about
+from hoidata.geometry.rotations import rotation_angles_about
 from hoidata.store.annotated import AnnotatedStore
 
 
@@ -152,7 +152,7 @@ def _upright(track: ObjectTrack, middle_m: np.ndarray, gravity: np.ndarray | Non
     rotation = track.world_from_object.rotation
     since_first = rotation @ rotation[0].T
     tilt = np.degrees(np.arccos(np.clip((since_first @ up) @ up, -1, 1)))
-    steps = turns_about(rotation, up)
+    steps = rotation_angles_about(rotation, up)
     # Smoothing first: tracking noise would add up in a sum of absolute steps.
     turn_deg = np.degrees(
         np.abs(np.convolve(steps, np.full(_SMOOTHING_FRAMES, 1 / _SMOOTHING_FRAMES), mode="full")).sum()

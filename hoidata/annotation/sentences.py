@@ -1,6 +1,6 @@
 """Sentences for one interaction, in the forms of Text2HOI (Cha et al. 2024, supplement, section 6).
 
-``four_sentences`` writes idiomatic English. ``reference_sentences`` writes like the reference implementation, for
+``english_sentences`` writes idiomatic English. ``reference_sentences`` writes like the reference implementation, for
 comparisons with models trained on its sentences: no articles, "with" in the passive, lower case after the first letter,
 object names without their size. Its misspellings ("openning", "takes take") and its passives without an auxiliary are
 corrected.
@@ -55,7 +55,7 @@ class Clause:
         return tuple(as_sentence(template.format(**vars(self))) for template in FORMS.values())
 
 
-def four_sentences(verb: str | None, object_words: str, hand: HandType) -> tuple[str, ...]:
+def english_sentences(verb: str | None, object_words: str, hand: HandType) -> tuple[str, ...]:
     """Write one sentence of each form, in idiomatic English.
 
     Examples: "Place a book with both hands.", "A book is placed by both hands.", "Both hands place a book.", "Placing a
@@ -97,7 +97,7 @@ def reference_sentences(verb: str | None, object_words: str, hand: HandType) -> 
     """Write one sentence of each form, as the reference implementation of Text2HOI does.
 
     Examples: "Place book with both hands.", "Book is placed with both hands.", "Both hands place book.", "Placing book
-    with both hands." Arguments and errors are those of ``four_sentences``.
+    with both hands." Arguments and errors are those of ``english_sentences``.
     """
     grammar = default_grammar()
     forms = grammar.verb(UNLABELLED_VERB if verb is None else verb)

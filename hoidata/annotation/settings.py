@@ -18,7 +18,7 @@ class AnnotationSettings:
     threshold_m: float | None = None  # a hand with a closer joint is active; None: threshold of the contact stage
     # Active hands: those close to the object, or the labelled hand if there is a label (Text2HOI does so for ARCTIC).
     hand: HandRule = "proximity"
-    forms: Forms = "paper"  # ``four_sentences`` or ``reference_sentences``
+    forms: Forms = "paper"  # ``english_sentences`` or ``reference_sentences``
     derive_verbs: bool = True  # derive a missing verb from the motion; False: the sentences say "move"
 
     def __post_init__(self) -> None:

@@ -14,10 +14,10 @@ import pyarrow as pa
 
 from hoidata.annotation.derived import derive_verb
 from hoidata.annotation.encoders import TextEncoder, load_encoder
-from hoidata.annotation.sentences import FORMS, four_sentences, reference_sentences
+from hoidata.annotation.sentences import FORMS, english_sentences, reference_sentences
 from hoidata.annotation.settings import AnnotationSettings
 from hoidata.clips import SIDES, Clip, HandType, Side
-from hoidata.contact.maps import acting_hands
+from hoidata.contact.maps import find_active_hands
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.contact.settings import ContactSettings
 from hoidata.contact.stage import sample_objects
@@ -163,7 +163,7 @@ class _Writer:
         """Return the sentences, or None and the reason."""
         if hand is None:
             return None, _no_hand(evidence)
-        write = four_sentences if self.settings.forms == "paper" else reference_sentences
+        write = english_sentences if self.settings.forms == "paper" else reference_sentences
         try:
             return write(clip.verb, clip.object_words, hand), None
         except BadInput as error:
@@ -178,7 +178,7 @@ def _annotate_clips(
     for clip_id in store.ids:
         clip = store.clip(clip_id)
         joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
-        evidence = acting_hands(clip, joints, indices[clip.object.model.name], threshold_m)
+        evidence = find_active_hands(clip, joints, indices[clip.object.model.name], threshold_m)
         hand, verb = writer.hand(clip, evidence), writer.verb(clip, evidence)
         clip = replace(clip, verb=verb.base)
         if clip_id in excluded:

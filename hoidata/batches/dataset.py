@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from hoidata.batches.frame_selection import FrameSelection
 from hoidata.batches.requests import ObjectPoints, RequestBatch, conditions
-from hoidata.batches.sight import Sight
 from hoidata.clips.clip import SIDES, HandTrack
 from hoidata.clips.features import OBJECT_POSITION, WRIST, hand_features, object_features, upright
 from hoidata.errors import BadInput
@@ -259,12 +259,12 @@ class ClipBatch(RequestBatch):
         return self.contact.any(1).float()
 
 
-def collate(samples: Sequence[ClipSample], sight: Sight | None = None) -> ClipBatch:
+def collate(samples: Sequence[ClipSample], sight: FrameSelection | None = None) -> ClipBatch:
     """Pad samples to one batch. sight: frames and distance entries of geometric losses; by default none."""
     lengths = np.array([sample.length for sample in samples])
     shared = conditions(samples, [sample.object_model for sample in samples], lengths)
     n_frames = int(lengths.max())
-    sight = sight or Sight.nothing(len(samples))
+    sight = sight or FrameSelection.nothing(len(samples))
     entries, distance = sight.entries([sample.distances for sample in samples])
     arrays = {
         "text": np.stack([sample.text for sample in samples]),

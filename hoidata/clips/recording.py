@@ -12,7 +12,7 @@ from hoidata.hands.tracked_hand import HandState, TrackedHand
 
 
 @dataclass(frozen=True, eq=False)
-class OwnHandTrack(Track):
+class SourceHandTrack(Track):
     """Motion of one hand with the skeleton of the source, world frame."""
 
     PER_FRAME: ClassVar = ("wrist_m", "rotvec")
@@ -32,7 +32,7 @@ class HandRecording:
     sequence: str
     fps: float
     hand: TrackedHand  # the right hand; the left hand is its mirror image
-    hands: dict[Side, OwnHandTrack]
+    hands: dict[Side, SourceHandTrack]
     object: ObjectTrack
     usable: np.ndarray  # (frame,) bool: False if tracking failed
     gravity: np.ndarray  # (3,) unit vector

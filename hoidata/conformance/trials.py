@@ -18,7 +18,7 @@ from hoidata.conformance.report import Finding, finding, skipped, undecided
 from hoidata.datasets.base import Adapter, SequenceKey
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
-from hoidata.lifetime import begin_worker, ctrl_c_blocked
+from hoidata.lifetime import block_ctrl_c, init_worker
 
 MAX_DAMAGED_FILES = 6
 DAMAGES = ("removed", "emptied", "cut in half")
@@ -59,8 +59,8 @@ class Trials:
         rule, item = "a worker process gives the same", self.loaded[0]
         context = multiprocessing.get_context("spawn")
         try:
-            with ProcessPoolExecutor(1, context, begin_worker) as pool:
-                with ctrl_c_blocked():
+            with ProcessPoolExecutor(1, context, init_worker) as pool:
+                with block_ctrl_c():
                     future = pool.submit(load_recorded, self.adapter, self.root, item.key, self.hands)
                 loaded_there = future.result()
         except Exception as error:  # an adapter that cannot be imported or pickled there breaks the pool

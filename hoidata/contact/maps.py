@@ -12,7 +12,7 @@ from hoidata.store.hand_evidence import HandEvidence
 LONGEST_CLIP = int(np.iinfo(np.int16).max)
 
 
-def acting_hands(
+def find_active_hands(
     clip: Clip,
     joints_m: Mapping[Side, np.ndarray],
     index: ProximityIndex,
@@ -43,7 +43,7 @@ def distance_entries(
 ) -> dict[Side, np.ndarray]:
     """Return, by hand, all (frame, point, joint) closer than ``threshold_m`` as ``ENTRY`` records.
 
-    Arguments as in ``acting_hands``. Raises BadInput for clips with more frames than int16 can count.
+    Arguments as in ``find_active_hands``. Raises BadInput for clips with more frames than int16 can count.
     """
     if clip.n_frames > LONGEST_CLIP:
         raise BadInput(clip.clip_id, f"at most {LONGEST_CLIP} frames", f"{clip.n_frames}", "cut the sequence")

@@ -20,7 +20,7 @@ from hoidata.files.written import write_table
 from hoidata.hands import HandPair
 from hoidata.objects.sampling import SampledPoints, sample_points
 from hoidata.store.store import Store, open_store
-from hoidata.workers import in_order, in_workers
+from hoidata.workers import in_order, map_in_workers
 
 ENTRIES_PER_SHARD = 1 << 23
 # Below this a second process costs more to start than it saves.
@@ -73,7 +73,7 @@ def contact_store(
         writer = _Writer(partial, points)
         store.hand_pair()
         jobs = min(jobs, 1 + sum(store.sequences["n_frames"].tolist()) // FRAMES_PER_JOB)
-        measured = in_workers(_Measurer(store, sampled, settings.threshold_m), store.ids, jobs)
+        measured = map_in_workers(_Measurer(store, sampled, settings.threshold_m), store.ids, jobs)
         for clip_id, entries in in_order(measured, store.ids):
             writer.add(clip_id, entries)
         counts = writer.finish() | {"objects": len(sampled)}

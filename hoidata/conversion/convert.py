@@ -20,12 +20,12 @@ from hoidata.clips.quarantine import Quarantined
 from hoidata.clips.validation import check_clip
 from hoidata.conversion.finished import FinishedWork, Item, job_description
 from hoidata.datasets.base import Adapter, HasHandRecordings, RawTree, SequenceKey
-from hoidata.errors import BadInput, ChangedMeanwhile
+from hoidata.errors import BadInput, RawFileChanged
 from hoidata.files.atomic import exclusive, remove_leftovers
 from hoidata.hands import HandPair
-from hoidata.store.info import stand_in_note, store_info
+from hoidata.store.info import embedded_hand_warning, store_info
 from hoidata.store.store import open_store, write_store
-from hoidata.workers import WorkerLost, in_workers
+from hoidata.workers import WorkerDied, map_in_workers
 
 DEFECT = "report this defect of hoidata"
 GENERATED_LICENCE = "CC0-1.0"
@@ -86,7 +86,7 @@ def convert_dataset(
 
     Raises:
         BadInput: another run writes ``out``, or the disk is full.
-        ChangedMeanwhile: see ``stop_on_change``.
+        RawFileChanged: see ``stop_on_change``.
     """
     hands = hands_for(adapter.hand_convention, hands)
     all_keys = adapter.sequences(Path(root)) if root is not None and Path(root).is_dir() else []
@@ -98,7 +98,7 @@ def convert_dataset(
     out, root = Path(out), Path(root or ".")
     if stop_on_change and (gone := [path for path in listed or () if not (root / path).exists()]):
         got, remedy = f"{len(gone)} gone, first {gone[0]}", "restore the files, or scan the raw folder again"
-        raise ChangedMeanwhile(root, "all files that are listed", got, remedy)
+        raise RawFileChanged(root, "all files that are listed", got, remedy)
     work = FinishedWork(out.with_name(f".{out.name}.work"), root)
     convert = SequenceConverter(
         adapter=adapter,
@@ -119,7 +119,7 @@ def convert_dataset(
         work.remove()
         # Read back, because writing the store also quarantines clips, such as one with a duplicate id.
         quarantined = tuple(Quarantined(**row) for row in open_store(out).quarantine.to_dict("records"))
-    warning = stand_in_note(info) if counts["clips"] else ""
+    warning = embedded_hand_warning(info) if counts["clips"] else ""
     summary = ConversionSummary(
         dataset=adapter.name,
         sequences=len(all_keys),
@@ -157,7 +157,7 @@ class SequenceConverter:
             if isinstance(self.adapter, HasHandRecordings) and any(isinstance(item, Clip) for item in results):
                 results += self.adapter.recordings(raw, key)
         except BadInput as error:
-            if self.stop_on_change and isinstance(error, ChangedMeanwhile):
+            if self.stop_on_change and isinstance(error, RawFileChanged):
                 raise
             self.work.save(key, [_quarantined(key, self.root, error)], None)
         except Exception as error:  # one sequence must not stop the others; the reason blames hoidata
@@ -166,7 +166,7 @@ class SequenceConverter:
         else:
             self.work.save(key, results, raw.sources)
 
-    def quarantine(self, lost: WorkerLost) -> None:
+    def quarantine(self, lost: WorkerDied) -> None:
         """Save the reason as the sequence's result; a resumed run does not try the sequence again."""
         self.work.save(lost.item, [_quarantined(lost.item, self.root, lost)], ())
 
@@ -178,7 +178,7 @@ def _convert_all(convert: SequenceConverter, keys: Sequence[SequenceKey], jobs: 
     title = f"convert {convert.adapter.name}" + (f" ({resumed} finished before)" if resumed else "")
     with Progress(console=Console(stderr=True), disable=not progress) as bar:
         task = bar.add_task(title, total=len(keys), completed=resumed)
-        for _ in in_workers(convert, missing, jobs, lock, convert.quarantine):
+        for _ in map_in_workers(convert, missing, jobs, lock, convert.quarantine):
             bar.advance(task)
     return resumed
 

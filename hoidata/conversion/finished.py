@@ -24,7 +24,7 @@ import numpy as np
 
 from hoidata.clips.clip import BodyTrack, CameraTrack, Clip, HandTrack, ObjectTrack, SourceContact, SourceFile
 from hoidata.clips.quarantine import Quarantined
-from hoidata.clips.recording import HandRecording, OwnHandTrack
+from hoidata.clips.recording import HandRecording, SourceHandTrack
 from hoidata.datasets.base import Adapter, SequenceKey
 from hoidata.datasets.registry import FACTS
 from hoidata.errors import BadInput
@@ -41,7 +41,7 @@ KINDS: dict[str, type] = {
     for kind in (
         *(Clip, HandTrack, ObjectTrack, CameraTrack, BodyTrack, SourceContact, SourceFile),
         *(ObjectModel, Hinge, Quarantined),
-        *(HandRecording, OwnHandTrack, TrackedHand, Skin, JointCapsules, RigidTransform),
+        *(HandRecording, SourceHandTrack, TrackedHand, Skin, JointCapsules, RigidTransform),
     )
 }
 SHARED = {("ObjectModel", "vertices_m"), ("ObjectModel", "faces"), ("ObjectModel", "part"), ("HandTrack", "template_m")}

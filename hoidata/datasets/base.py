@@ -23,7 +23,7 @@ from hoidata.clips.quarantine import Quarantined
 from hoidata.clips.recording import HandRecording
 from hoidata.dataset_folders import DatasetFacts
 from hoidata.datasets import checks
-from hoidata.errors import BadInput, ChangedMeanwhile
+from hoidata.errors import BadInput, RawFileChanged
 from hoidata.files import sha256_bytes, sha256_file
 from hoidata.hands import HandPair
 
@@ -288,7 +288,7 @@ class RawTree:
     def _inside(self, path: str) -> Path:
         file = self.root / path
         if not file.is_file():
-            error_type = ChangedMeanwhile if path in (self.manifest or ()) else BadInput
+            error_type = RawFileChanged if path in (self.manifest or ()) else BadInput
             raise error_type(path, "a file", "nothing there", "check that the download is complete and unpacked here")
         if not self._is_inside(path):
             raise BadInput(path, "a file inside the raw folder", "a link that leaves it", "replace the link by a copy")
@@ -306,7 +306,7 @@ class RawTree:
         if listed.sha256 != source.sha256:
             expected = f"SHA-256 {listed.sha256[:12]} ({listed.size} bytes)"
             got = f"{source.sha256[:12]} ({source.size} bytes)"
-            raise ChangedMeanwhile(source.path, expected, got, "restore the file, or scan the raw folder again")
+            raise RawFileChanged(source.path, expected, got, "restore the file, or scan the raw folder again")
 
 
 def _read_small(folder: int, name: str) -> bytes | None:

@@ -13,7 +13,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from hoidata.annotation.derived import turning_points
 from hoidata.clips.clip import FPS, SIDES, Clip, Side
-from hoidata.contact.maps import acting_hands
+from hoidata.contact.maps import find_active_hands
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.contact.settings import ContactSettings
 from hoidata.geometry.intervals import Interval, bridged, runs
@@ -71,7 +71,7 @@ def segment_clips(recording: Clip, hands: HandPair) -> list[Clip]:
         return [recording]
     points = sample_points(recording.object.model, ContactSettings().points)
     joints_m: dict[Side, np.ndarray] = {side: track_joints(recording.hands[side], hands[side]) for side in SIDES}
-    evidence = acting_hands(recording, joints_m, ProximityIndex(points), ContactSettings().threshold_m)
+    evidence = find_active_hands(recording, joints_m, ProximityIndex(points), ContactSettings().threshold_m)
     return [_taken(recording, segment) for segment in find_segments(recording, evidence)] or [recording]
 
 

@@ -106,7 +106,7 @@ def rot6d_to_rotmat(rot6d: Array) -> Array:
     return torch.stack((first, second, torch.linalg.cross(first, second, dim=-1)), -1)
 
 
-def turns_about(rotmat: np.ndarray, axis: np.ndarray) -> np.ndarray:
+def rotation_angles_about(rotmat: np.ndarray, axis: np.ndarray) -> np.ndarray:
     """(frame - 1,) angles in radians about a unit axis (3,) between successive rotations (frame, 3, 3)."""
     return rotmat_to_rotvec(rotmat[1:] @ rotmat[:-1].swapaxes(1, 2)) @ axis
 

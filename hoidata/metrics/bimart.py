@@ -7,7 +7,7 @@ winding number is odd, so the overlap of two parts counts as outside; the releas
 Any depth counts as contact.
 
 ``corrected`` tests the solid that each part encloses (``SurfaceIndex``). Open parts enclose none and are skipped;
-``solid_note`` reports them. Contact is a vertex within 5 mm of the surface in a frame with no vertex deeper than 1 cm.
+``repair_note`` reports them. Contact is a vertex within 5 mm of the surface in a frame with no vertex deeper than 1 cm.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +25,7 @@ from hoidata.metrics.unmeasured import NO_INSIDE, RIGID, Unmeasured, Values
 from hoidata.objects.distance import MergedSurface, merged_surface
 from hoidata.objects.model import ObjectModel, articulate
 from hoidata.objects.surface_index import GRID_PAYS_FROM, PartSurface, SurfaceIndex, surface_index
-from hoidata.surface.contact import PlacedHand, deepest_m
+from hoidata.surface.contact import HandInObjectFrame, deepest_m
 
 NEAR_M = 0.005
 DEEP_M, LESS_DEEP_M = 0.01, 0.005
@@ -185,7 +185,7 @@ def _corner_parts(model: ObjectModel) -> np.ndarray:
     return model.part[model.faces] if model.is_articulated else np.zeros_like(model.faces)
 
 
-def whole_depth_m(hand: PlacedHand, model: ObjectModel) -> np.ndarray:
+def whole_depth_m(hand: HandInObjectFrame, model: ObjectModel) -> np.ndarray:
     """(valid frame, 778) depth of vertices in the whole posed mesh, positive inside; -inf beyond 2 cm outside."""
     shape, part_shells = hand.vertices_m.shape[:2], shells(surface_index(model))
     local = {part: _in_part(hand, model, part) for part in part_shells}
@@ -202,7 +202,7 @@ def whole_depth_m(hand: PlacedHand, model: ObjectModel) -> np.ndarray:
     return np.where(inside, distance, -distance)
 
 
-def _seam_meshes(model: ObjectModel, hand: PlacedHand) -> Iterator[MergedSurface]:
+def _seam_meshes(model: ObjectModel, hand: HandInObjectFrame) -> Iterator[MergedSurface]:
     """Per frame, the posed triangles with corners in both parts, object frame; empty if there are none."""
     corners = _corner_parts(model)
     seam = corners.min(axis=1) != corners.max(axis=1)
@@ -213,13 +213,13 @@ def _seam_meshes(model: ObjectModel, hand: PlacedHand) -> Iterator[MergedSurface
             yield MergedSurface(np.ascontiguousarray(posed, np.float64), faces)
 
 
-def _in_part(hand: PlacedHand, model: ObjectModel, part: int) -> np.ndarray:
+def _in_part(hand: HandInObjectFrame, model: ObjectModel, part: int) -> np.ndarray:
     """(frame x 778, 3) hand vertices in a part's rest frame."""
     local = model.object_from_part(part, hand.hinge_rad).inverse() @ hand.vertices_m
     return np.ascontiguousarray(local.reshape(-1, 3))
 
 
-def part_depth_m(hand: PlacedHand, model: ObjectModel, part: int) -> np.ndarray:
+def part_depth_m(hand: HandInObjectFrame, model: ObjectModel, part: int) -> np.ndarray:
     """(valid frame, 778) depth in the triangles of one part alone, positive inside; -inf beyond 2 cm outside."""
     shell, shape = shells(surface_index(model)).get(part), hand.vertices_m.shape[:2]
     return np.full(shape, -np.inf) if shell is None else shell.depth_m(_in_part(hand, model, part)).reshape(shape)
@@ -230,7 +230,7 @@ def _deepest_paper_m(pair: Pair, moving_part: bool = False) -> np.ndarray:
     """(frame,) depth of the deepest vertex of the acting hands, negative outside; NaN in frames without a hand."""
     model, hands = pair.predicted.clip.object.model, placed_hands(pair)
     depths = [part_depth_m(hand, model, 1) if moving_part else whole_depth_m(hand, model) for hand in hands]
-    per_frame = [hand.over_clip(depth.max(axis=1), np.nan) for hand, depth in zip(hands, depths, strict=True)]
+    per_frame = [hand.expand_to_clip(depth.max(axis=1), np.nan) for hand, depth in zip(hands, depths, strict=True)]
     return _of_hands(per_frame, pair)
 
 
@@ -286,12 +286,12 @@ def _sound_contact(pair: Pair, moving_part: bool = False) -> np.ndarray:
     per_frame = []
     for hand in placed_hands(pair):
         touching = _is_near(hand, model, surfaces).max(axis=1).astype(np.float64)
-        per_frame.append(hand.over_clip(np.asarray(touching), np.nan))
+        per_frame.append(hand.expand_to_clip(np.asarray(touching), np.nan))
     depth = _depth_m(pair)
     return np.where(np.isnan(depth), np.nan, _of_hands(per_frame, pair) * (depth <= DEEP_M))
 
 
-def _is_near(hand: PlacedHand, model: ObjectModel, surfaces: dict[int, PartSurface]) -> np.ndarray:
+def _is_near(hand: HandInObjectFrame, model: ObjectModel, surfaces: dict[int, PartSurface]) -> np.ndarray:
     near = np.zeros(hand.vertices_m.shape[:2], bool)
     for part, surface in surfaces.items():
         local = model.object_from_part(part, hand.hinge_rad).inverse() @ hand.vertices_m
@@ -301,7 +301,7 @@ def _is_near(hand: PlacedHand, model: ObjectModel, surfaces: dict[int, PartSurfa
 
 
 @lru_cache(maxsize=1)
-def placed_hands(pair: Pair) -> list[PlacedHand]:
+def placed_hands(pair: Pair) -> list[HandInObjectFrame]:
     """The acting hands of the prediction in the object frame, in the frames in which they are measured."""
     clip = pair.predicted.clip
     hands = []
@@ -310,7 +310,7 @@ def placed_hands(pair: Pair) -> list[PlacedHand]:
         local = clip.object.world_from_object.inverse() @ _vertices_m(pair.predicted, side).astype(np.float64)
         hinge = None if clip.object.hinge_rad is None else clip.object.hinge_rad[frames]
         faces = pair.predicted.hands[side].faces
-        hands.append(PlacedHand(local[frames], frames, hinge, faces=faces, n_frames=clip.n_frames))
+        hands.append(HandInObjectFrame(local[frames], frames, hinge, faces=faces, n_frames=clip.n_frames))
     return hands
 
 

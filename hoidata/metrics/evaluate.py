@@ -30,14 +30,14 @@ from hoidata.metrics.feature_metrics import encoder_summary
 from hoidata.metrics.intervals import bootstrap_interval, t_interval
 from hoidata.metrics.pair import Motion, Pair, TrueContact, acting_sides
 from hoidata.metrics.registry import METRICS, Metric, count_unmeasured, sum_and_count, summarise
-from hoidata.metrics.target_contact import AskedDistances, read_asked, read_asked_distances
+from hoidata.metrics.target_contact import TargetDistances, read_target_contact, read_target_distances
 from hoidata.metrics.unmeasured import CHOSEN_LENGTH, Values
 from hoidata.objects.model import ObjectModel
 from hoidata.physics.scene import object_scene
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.distances import DistanceEntries
 from hoidata.store.store import Store, open_store
-from hoidata.workers import in_workers
+from hoidata.workers import map_in_workers
 
 SAME_MESH_M = 1e-5  # above the float32 rounding of metres
 DIGITS = 6
@@ -118,14 +118,14 @@ def evaluate_store(
         store=store,
         metrics=metrics,
         samples=samples,
-        target_contact=read_asked(predicted),
-        target_distances=read_asked_distances(predicted),
+        target_contact=read_target_contact(predicted),
+        target_distances=read_target_distances(predicted),
         actions=training_actions(annotated),
     )
     jobs = jobs if sum(map(len, samples.values())) >= WORKERS_PAY_FROM else 1
     result_by_id: dict[str, ClipResult] = {}
     with Progress(console=Console(stderr=True), disable=not progress) as bar:
-        results = in_workers(evaluator.measure, clip_ids, jobs)
+        results = map_in_workers(evaluator.measure, clip_ids, jobs)
         for clip_id, result in bar.track(results, len(clip_ids), description="evaluate"):
             result_by_id[clip_id] = result
     clips = [result_by_id[clip_id] for clip_id in clip_ids]
@@ -247,7 +247,7 @@ class _Evaluator:
     metrics: tuple[Metric, ...]
     samples: dict[str, list[str]]  # predicted ids by reference id
     target_contact: dict[str, np.ndarray]  # by predicted id
-    target_distances: dict[str, AskedDistances]  # by predicted id
+    target_distances: dict[str, TargetDistances]  # by predicted id
     actions: Actions
     indices: dict[str, ProximityIndex] = field(default_factory=dict)  # cache by object
 
@@ -332,7 +332,7 @@ def _values(metric: Metric, pair: Pair) -> Values:
     return CHOSEN_LENGTH if metric.aligned and not pair.aligned else metric.measure(pair, metric.frame_step)
 
 
-def _map_mismatch(distances: AskedDistances, clip: Clip) -> str:
+def _map_mismatch(distances: TargetDistances, clip: Clip) -> str:
     """Why a target distance map does not belong to this clip; "" if it does."""
     count = len(distances.distance_m)
     return "" if count == clip.n_frames else f"the target distance map has {count} frames, not {clip.n_frames}"

@@ -107,7 +107,7 @@ BIMART_METRICS: tuple[Metric, ...] = (
 OPTIONAL_LISTS: Mapping[str, tuple[Metric, ...]] = MappingProxyType({"bimart": BIMART_METRICS})
 
 
-def with_lists(names: Iterable[str]) -> tuple[Metric, ...]:
+def select_metrics(names: Iterable[str]) -> tuple[Metric, ...]:
     """``METRICS`` and then the metrics of the named optional lists. Raises BadInput for an unknown name."""
     names = list(names)
     if unknown := [name for name in names if name not in OPTIONAL_LISTS]:

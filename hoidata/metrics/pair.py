@@ -10,7 +10,7 @@ from hoidata.actions.action import Actions
 from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import HandPair
-from hoidata.metrics.target_contact import AskedDistances
+from hoidata.metrics.target_contact import TargetDistances
 from hoidata.metrics.unmeasured import NO_GRAVITY, NO_INSIDE, Unmeasured
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.scene import Scene, clip_scene
@@ -58,7 +58,7 @@ class Pair:
     target_contact: np.ndarray | None = None  # (point,) bool, the contact map that the prediction was conditioned on
     verb: str | None = None  # of the reference clip
     actions: Actions | None = None  # usual motion measures per verb
-    target_distances: AskedDistances | None = None  # the distance map that the prediction was conditioned on
+    target_distances: TargetDistances | None = None  # the distance map that the prediction was conditioned on
 
     @property
     def _timed(self) -> Clip:

@@ -32,7 +32,7 @@ DISTANCES_NAME = "asked-distances.npz"
 REMEDY = "sample the family again"
 
 
-class AskedDistances(NamedTuple):
+class TargetDistances(NamedTuple):
     """The target distance map of one motion, frame by frame."""
 
     place_m: np.ndarray  # (frame, point, 3) positions on the object in that frame's pose, object frame
@@ -40,13 +40,13 @@ class AskedDistances(NamedTuple):
     hand_vertices: np.ndarray  # (n,) int32, the vertices among 778 that the distances refer to
 
 
-def write_asked(folder: str | Path, targets: Mapping[str, np.ndarray]) -> None:
+def write_target_contact(folder: str | Path, targets: Mapping[str, np.ndarray]) -> None:
     """Write ``folder/asked.npz`` from (point,) bool maps by motion id."""
     arrays = {"motion_id": np.array(list(targets)), "asked": np.stack(list(targets.values()))}
     write_npz(Path(folder) / FILE_NAME, arrays)
 
 
-def read_asked(clips: str | Path) -> dict[str, np.ndarray]:
+def read_target_contact(clips: str | Path) -> dict[str, np.ndarray]:
     """(point,) bool by motion id, from the file next to the folder ``clips``; empty without it. Raises BadInput."""
     path = Path(clips).parent / FILE_NAME
     if not path.is_file():
@@ -59,7 +59,7 @@ def read_asked(clips: str | Path) -> dict[str, np.ndarray]:
     return dict(zip(names.tolist(), maps, strict=True))
 
 
-def write_asked_distances(folder: str | Path, targets: Mapping[str, AskedDistances]) -> None:
+def write_target_distances(folder: str | Path, targets: Mapping[str, TargetDistances]) -> None:
     """Write ``folder/asked-distances.npz`` from target maps by motion id.
 
     float16 rounds positions by less than 0.15 mm within 0.5 m, distances by less than 0.1 mm below 20 cm.
@@ -89,7 +89,7 @@ def write_asked_distances(folder: str | Path, targets: Mapping[str, AskedDistanc
     write_npz(Path(folder) / DISTANCES_NAME, arrays)
 
 
-def read_asked_distances(clips: str | Path) -> dict[str, AskedDistances]:
+def read_target_distances(clips: str | Path) -> dict[str, TargetDistances]:
     """Target maps by motion id, from the file next to the folder ``clips``; empty without it. Raises BadInput."""
     path = Path(clips).parent / DISTANCES_NAME
     if not path.is_file():
@@ -106,7 +106,7 @@ def read_asked_distances(clips: str | Path) -> dict[str, AskedDistances]:
             raise ValueError("numbers of hand vertices out of range")
         spans = [slice(*ends) for ends in pairwise(first.tolist())]
         return {
-            str(name): AskedDistances(place_m[start : start + count], distance_m[span], hand)
+            str(name): TargetDistances(place_m[start : start + count], distance_m[span], hand)
             for name, start, count, span in zip(names, starts, counts, spans, strict=True)
         }
     except (KeyError, ValueError, IndexError) as error:

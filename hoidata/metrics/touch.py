@@ -18,7 +18,7 @@ from hoidata.metrics.unmeasured import NO_INSIDE, Unmeasured, Values
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
 from hoidata.physics.capsules import Capsules
 from hoidata.physics.mano_capsules import hand_capsules
-from hoidata.surface.contact import PlacedHand, deepest_m, placed_hand
+from hoidata.surface.contact import HandInObjectFrame, deepest_m, hand_in_object_frame
 from hoidata.surface.solid_overlap import SolidOverlap
 
 DEEP_MM = 10.0
@@ -141,10 +141,13 @@ def _deepest_m(pair: Pair, frame_step: int) -> Values:
 
 
 @lru_cache(maxsize=1)
-def _hands(pair: Pair, frame_step: int) -> list[PlacedHand]:
+def _hands(pair: Pair, frame_step: int) -> list[HandInObjectFrame]:
     """The acting hands in every n-th frame in which they are measured."""
     clip = pair.predicted.clip
-    return [_at(placed_hand(clip, side, pair.predicted.hands), pair.frames(side, frame_step)) for side in pair.sides]
+    return [
+        _at(hand_in_object_frame(clip, side, pair.predicted.hands), pair.frames(side, frame_step))
+        for side in pair.sides
+    ]
 
 
 @lru_cache(maxsize=64)
@@ -155,7 +158,7 @@ def _overlap(index: SurfaceIndex) -> SolidOverlap | Unmeasured:
         return TOO_LARGE
 
 
-def _at(hand: PlacedHand, frames: np.ndarray) -> PlacedHand:
+def _at(hand: HandInObjectFrame, frames: np.ndarray) -> HandInObjectFrame:
     """The hand in a subset of the frames in which it is valid."""
     chosen = np.searchsorted(hand.frames, frames)
     hinge_rad = None if hand.hinge_rad is None else hand.hinge_rad[chosen]

@@ -115,7 +115,7 @@ class SurfaceIndex:
         """
         self.model = model
         self.solids = model.solids  # by part, the solid that it bounds or the reason why it bounds none
-        self.solid_note = _note(model, self.solids)  # repairs, and parts excluded from depths; None without either
+        self.repair_note = _note(model, self.solids)  # repairs, and parts excluded from depths; None without either
         self._surfaces: dict[int, PartSurface] = {}
         self._closed: dict[int, PartSurface] = {}
         for part, solid in self.solids.items():

@@ -28,7 +28,7 @@ class Capsules(NamedTuple):
         """A subset of frames and capsules."""
         return Capsules(self.start_m[frames][:, capsules], self.end_m[frames][:, capsules], self.radius_m[capsules])
 
-    def seen_from(self, a_from_world: RigidTransform) -> "Capsules":
+    def relative_to(self, a_from_world: RigidTransform) -> "Capsules":
         """Transform world capsules to frame a by ``a_from_world`` (frame,)."""
         return Capsules(a_from_world @ self.start_m, a_from_world @ self.end_m, self.radius_m)
 

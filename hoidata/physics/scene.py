@@ -97,7 +97,7 @@ class Scene:
         return twin
 
 
-def capsules_there(track: HandTrack, hand: HandModel) -> Capsules:
+def capsules_or_nan(track: HandTrack, hand: HandModel) -> Capsules:
     """World capsules of a hand, NaN in frames without the hand."""
     capsules, valid = hand_capsules(track, hand), track.valid[:, None, None]
     return Capsules(
@@ -107,7 +107,7 @@ def capsules_there(track: HandTrack, hand: HandModel) -> Capsules:
 
 def clip_scene(clip: Clip, hands: HandPair, table_m: float | None = None) -> Scene:
     """Scene of a clip with 19 capsules per hand, left first, at 30 fps. Raises BadInput without gravity."""
-    capsules = [capsules_there(clip.hands[side], hands[side]) for side in SIDES]
+    capsules = [capsules_or_nan(clip.hands[side], hands[side]) for side in SIDES]
     return object_scene(clip, table_m).with_capsules(joined(capsules))
 
 

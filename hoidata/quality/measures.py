@@ -16,7 +16,7 @@ from hoidata.quality import motion
 from hoidata.quality.meshes import SurfaceFacts, part_facts
 from hoidata.quality.thresholds import Thresholds
 from hoidata.quality.timing import ObjectMotion, time_offset
-from hoidata.surface.contact import deepest_m, placed_hand
+from hoidata.surface.contact import deepest_m, hand_in_object_frame
 
 NAN = float("nan")
 STILL_M = 0.001  # a smaller step from frame to frame counts as no motion
@@ -175,7 +175,7 @@ def _penetration(clip: Clip, facts: ObjectFacts, hands: HandPair, thresholds: Th
         return {"penetration_m": NAN, "penetration_share": NAN, "note": note}
     sampled = clip.take(slice(None, None, thresholds.penetration_every))
     index = surface_index(facts.model)
-    depth = np.nan_to_num([deepest_m(placed_hand(sampled, side, hands), index) for side in SIDES]).max(axis=0)
+    depth = np.nan_to_num([deepest_m(hand_in_object_frame(sampled, side, hands), index) for side in SIDES]).max(axis=0)
     solid, parts = len(facts.solid_parts), len(facts.surfaces)
     return {
         "penetration_m": float(depth.max()),

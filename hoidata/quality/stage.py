@@ -32,7 +32,7 @@ from hoidata.quality.thresholds import (
 )
 from hoidata.settings import plain_config
 from hoidata.store.store import Store, open_store
-from hoidata.workers import in_workers
+from hoidata.workers import map_in_workers
 
 # Below this a second process costs more to start than it saves.
 FRAMES_PER_JOB = 50_000
@@ -116,7 +116,7 @@ def _measured(
     frames = sum(store.sequences["n_frames"].tolist())
     jobs = min(jobs, 1 + frames // FRAMES_PER_JOB)
     with Progress(console=Console(stderr=True), disable=not progress) as bar:
-        rows = dict(bar.track(in_workers(measure, store.ids, jobs), len(store), description="quality"))
+        rows = dict(bar.track(map_in_workers(measure, store.ids, jobs), len(store), description="quality"))
     return [rows[clip_id] for clip_id in store.ids]
 
 

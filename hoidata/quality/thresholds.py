@@ -172,7 +172,7 @@ def _reason(measure: Measure, values: Mapping[str, float], limit: float) -> str:
     return f"{measure.words}: {values[measure.name]:.3g}{unit}{frame}, above {limit:g}{unit}"
 
 
-def left_out_reasons(folder: str | Path) -> dict[str, str]:
+def exclusion_reasons(folder: str | Path) -> dict[str, str]:
     """Return the reasons of excluded clips, by clip id. Raises MissingResource if the stage has not run."""
     require_output(folder, "quality", "clips.parquet")
     rows = read_table(Path(folder) / "clips.parquet", ["clip_id", "verdict", "reasons"])

@@ -1,16 +1,16 @@
 """Fitting of hands to generated keypoints, refinement against the object, and contact refinement of grasps."""
 
-from hoidata.refinement.fitting import GeneratedHand, fit_hands
-from hoidata.refinement.holding import HoldSettings, carried_share, hold_clip, hold_hands
+from hoidata.refinement.fitting import GeneratedKeypoints, fit_hands
+from hoidata.refinement.holding import GraspSettings, carried_fraction, refine_grasps, refined_tracks
 from hoidata.refinement.refining import RefinementSettings, refine_hands
 
 __all__ = [
-    "GeneratedHand",
-    "HoldSettings",
+    "GeneratedKeypoints",
+    "GraspSettings",
     "RefinementSettings",
-    "carried_share",
+    "carried_fraction",
     "fit_hands",
-    "hold_clip",
-    "hold_hands",
+    "refine_grasps",
     "refine_hands",
+    "refined_tracks",
 ]

@@ -22,12 +22,12 @@ from hoidata.hands.model import N_VERTICES, HandModel, HandPair
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.capsules import CapsuleContacts, Capsules, joined
 from hoidata.physics.realism import StandardUnits
-from hoidata.physics.scene import Scene, capsules_there, object_scene
+from hoidata.physics.scene import Scene, capsules_or_nan, object_scene
 from hoidata.refinement.grasp_solver import Attraction, HandMotion, SolverSettings
 from hoidata.refinement.kernels import N_UNKNOWNS
 from hoidata.refinement.object_field import ObjectField, world_from_part
-from hoidata.refinement.regrasping import Held, RegraspSettings, bends_rad, grasps_that_carry
-from hoidata.refinement.resting import RestSettings, rest_object
+from hoidata.refinement.regrasping import GraspSearchSettings, Held, bends_rad, search_grasps
+from hoidata.refinement.resting import RestingSettings, snap_to_rest
 from hoidata.refinement.skin import HandPose, SkinnedHand
 from hoidata.workers import one_thread
 
@@ -40,7 +40,7 @@ _UNDER_M = 0.005  # so much lower than the table, or than before, a hand with an
 
 
 @dataclass(frozen=True)
-class HoldSettings:
+class GraspSettings:
     """Contact refinement: what counts as a grasp, and how it is corrected.
 
     Raises BadInput if reach_m and keypoint_m differ in length or are empty.
@@ -61,8 +61,8 @@ class HoldSettings:
         4  # frames with the object in the air in which the hands must carry it, or there is another attempt
     )
     solver: SolverSettings = field(default_factory=SolverSettings)
-    regrasp: RegraspSettings = field(default_factory=RegraspSettings)  # after the last attempt
-    rest: RestSettings = field(default_factory=RestSettings)  # before the first attempt
+    regrasp: GraspSearchSettings = field(default_factory=GraspSearchSettings)  # after the last attempt
+    rest: RestingSettings = field(default_factory=RestingSettings)  # before the first attempt
 
     def __post_init__(self) -> None:
         if len(self.reach_m) != len(self.keypoint_m) or not self.reach_m:
@@ -73,20 +73,20 @@ class HoldSettings:
 
 
 @one_thread()
-def hold_clip(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> Clip:
-    """Snap a resting object to its first height (``resting``), then refine the hands (``hold_hands``)."""
-    clip = rest_object(clip, settings.rest)
-    return replace(clip, hands=hold_hands(pair, clip, settings))
+def refine_grasps(pair: HandPair, clip: Clip, settings: GraspSettings = GraspSettings()) -> Clip:
+    """Snap a resting object to its first height (``resting``), then refine the hands (``refined_tracks``)."""
+    clip = snap_to_rest(clip, settings.rest)
+    return replace(clip, hands=refined_tracks(pair, clip, settings))
 
 
 @one_thread()
-def carried_share(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> float:
+def carried_fraction(pair: HandPair, clip: Clip, settings: GraspSettings = GraspSettings()) -> float:
     """Fraction of some frames with the object in the air in which the hands can carry it; 1 without such frames."""
-    return _Load.of(clip, settings.air_frames).carried_share(pair, clip.hands)
+    return _Load.of(clip, settings.air_frames).carried_fraction(pair, clip.hands)
 
 
 @one_thread()
-def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> dict[Side, HandTrack]:
+def refined_tracks(pair: HandPair, clip: Clip, settings: GraspSettings = GraspSettings()) -> dict[Side, HandTrack]:
     """Refine the hands of a clip; hands without a grasp and invalid frames are unchanged.
 
     An object without known gravity or without an inside counts as carried.
@@ -101,7 +101,7 @@ def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings
         for side, start in starts.items():
             parts.setdefault(side, start.part)
         tracks = _solved(pair, clip, starts, settings.solver, Attraction(reach, keypoint))
-        share = load.carried_share(pair, tracks)
+        share = load.carried_fraction(pair, tracks)
         # A try that carries no more than the best so far is no answer, but the next one goes on from it.
         if share > most:
             best, most = tracks, share
@@ -114,7 +114,7 @@ def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings
 
 
 def _regrasped(
-    pair: HandPair, clip: Clip, load: "_Load", settings: HoldSettings, parts: Mapping[Side, int]
+    pair: HandPair, clip: Clip, load: "_Load", settings: GraspSettings, parts: Mapping[Side, int]
 ) -> dict[Side, HandTrack]:
     """The hands of a clip, with another grasp in every hold that cannot carry and where one that can is found.
 
@@ -125,12 +125,12 @@ def _regrasped(
         if (grip := _grip(pair, side, clip, settings, parts.get(side))) is None:
             continue
         opposite = _OPPOSITE[side]
-        other = capsules_there(tracks[opposite], pair[opposite]) if tracks[opposite].valid.any() else None
+        other = capsules_or_nan(tracks[opposite], pair[opposite]) if tracks[opposite].valid.any() else None
         tracks[side] = grip.regrasped(pair[side], load, other, settings)
     return tracks
 
 
-def _starts(pair: HandPair, clip: Clip, settings: HoldSettings, parts: Mapping[Side, int]) -> dict[Side, "_Start"]:
+def _starts(pair: HandPair, clip: Clip, settings: GraspSettings, parts: Mapping[Side, int]) -> dict[Side, "_Start"]:
     """The hands that hold something; of ``parts`` that one, where a hand has one there."""
     grips: dict[Side, _Grip] = {}
     for side in SIDES:
@@ -149,7 +149,7 @@ def _solved(
     tracks = dict(clip.hands)
     for side, start in starts.items():
         opposite = _OPPOSITE[side]
-        other = capsules_there(tracks[opposite], pair[opposite]) if tracks[opposite].valid.any() else None
+        other = capsules_or_nan(tracks[opposite], pair[opposite]) if tracks[opposite].valid.any() else None
         tracks[side] = start.solved(other, wishes, draw)
     return tracks
 
@@ -181,15 +181,15 @@ class _Load:
         """Whether a hand, with the capsules of the other where there is one, carries in all of the frames."""
         if not len(self.frames):
             return True
-        hands = [capsules_there(track.take(self.frames), hand)]
+        hands = [capsules_or_nan(track.take(self.frames), hand)]
         return self.carried([*hands, *([] if other is None else [other.taken(self.frames)])]) == 1
 
-    def carried_share(self, pair: HandPair, tracks: Mapping[Side, HandTrack]) -> float:
+    def carried_fraction(self, pair: HandPair, tracks: Mapping[Side, HandTrack]) -> float:
         """As ``carried``, by the hands that are there at all."""
         there: list[Side] = [side for side in SIDES if tracks[side].valid.any()]
         if not len(self.frames) or not there:
             return float(not len(self.frames))
-        return self.carried([capsules_there(tracks[side].take(self.frames), pair[side]) for side in there])
+        return self.carried([capsules_or_nan(tracks[side].take(self.frames), pair[side]) for side in there])
 
     def carried(self, hands: Sequence[Capsules]) -> float:
         """Share of the frames in which friction at the contacts can give the object's motion; hands in those frames."""
@@ -241,12 +241,12 @@ class _Start:
 
     def solved(self, other: Capsules | None, settings: SolverSettings, draw: Attraction) -> HandTrack:
         """The corrected hand; frames without it stay as they were. other: capsules of the other, world frame."""
-        other = None if other is None else other.seen_from(self.part_from_world)
+        other = None if other is None else other.relative_to(self.part_from_world)
         valid, held = self.track.valid, (self.part, self.passed)
         hand = HandMotion(self.skin, self.field, self.pose, self.holds, valid, other, settings, draw, *held)
         pose = hand.corrected()
         track = self.track
-        made = pose.seen_from(self.part_from_world.inverse()).track(track.mean_betas, track.valid, track.template_m)
+        made = pose.relative_to(self.part_from_world.inverse()).track(track.mean_betas, track.valid, track.template_m)
         kept = {name: getattr(track, name) for name in ("wrist_m", "global_orient", "hand_pose")}
         return replace(
             track, **{name: np.where(valid[:, None], getattr(made, name), own) for name, own in kept.items()}
@@ -291,7 +291,7 @@ class _Grip:
             holds.append(Interval(start - _leading(before[:start][::-1], early), stop + _leading(after[stop:], late)))
         return replace(self, holds=holds)
 
-    def regrasped(self, hand: HandModel, load: _Load, other: Capsules | None, settings: HoldSettings) -> HandTrack:
+    def regrasped(self, hand: HandModel, load: _Load, other: Capsules | None, settings: GraspSettings) -> HandTrack:
         """The hand with another grasp in each hold that cannot carry and where one is found that can.
 
         other: capsules of the other hand, world.
@@ -323,7 +323,7 @@ class _Grip:
         return np.array([bends_rad(pose)[there].max(), depth_m[there].max(), ways_m.max(initial=0)])
 
     def _other_grasps(
-        self, hand: HandModel, hold: Interval, load: _Load, other: Capsules | None, settings: HoldSettings
+        self, hand: HandModel, hold: Interval, load: _Load, other: Capsules | None, settings: GraspSettings
     ) -> Iterator[HandPose]:
         """Some for a hold that carry where the hand's own does not, one frame each in the part's frame.
 
@@ -332,20 +332,20 @@ class _Grip:
         scene, every = load.scene, np.arange(hold.start, hold.stop)
         if scene is None:
             return iter(())
-        floor_m = min(scene.table_height_m, scene.lowest_of_m(capsules_there(self.track.take(every), hand)))
+        floor_m = min(scene.table_height_m, scene.lowest_of_m(capsules_or_nan(self.track.take(every), hand)))
 
         def carries(pose: HandPose) -> bool:
             track = self._everywhere(pose)
-            lowest_m = scene.lowest_of_m(capsules_there(track.take(every), hand))
+            lowest_m = scene.lowest_of_m(capsules_or_nan(track.take(every), hand))
             return lowest_m > floor_m - _UNDER_M and load.carried_by(track, hand, other)
 
         held = self._held(hand, load, other, _passed(load.clip.object, [hold]) is not None)
-        found = grasps_that_carry(held, carries, settings.solver, settings.regrasp)
+        found = search_grasps(held, carries, settings.solver, settings.regrasp)
         return islice(found, settings.regrasp.answers)
 
     def _everywhere(self, pose: HandPose) -> HandTrack:
         """The hand in one pose, one frame in the part's frame, all the time."""
-        moved = pose.taken(np.zeros(len(self.track.valid), int)).seen_from(self.world_from_part)
+        moved = pose.taken(np.zeros(len(self.track.valid), int)).relative_to(self.world_from_part)
         return moved.track(self.track.mean_betas, self.track.valid, self.track.template_m)
 
     def _held(self, hand: HandModel, load: _Load, other: Capsules | None, passed: bool) -> Held:
@@ -359,16 +359,16 @@ class _Grip:
             ObjectField(_in_part(load.clip.object, self.object_from_part)),
             self.part,
             passed,
-            self.pose.taken(middle).seen_from(part_from_world),
+            self.pose.taken(middle).relative_to(part_from_world),
             int(middle[0]),
             (part_from_world @ load.scene.motion.centre_m[middle][:, None])[0, 0],
-            None if other is None else other.taken(middle).seen_from(part_from_world),
+            None if other is None else other.taken(middle).relative_to(part_from_world),
         )
 
     def start(self, thing: ObjectTrack, blend: int, grasps: Mapping[int, HandPose] = MappingProxyType({})) -> _Start:
         """The hand in the part's frame, at rest in its holds: in the ones numbered in ``grasps`` in that pose."""
         part_from_world = self.world_from_part.inverse()
-        pose = _at_rest(self.pose.seen_from(part_from_world), self.holds, blend, grasps)
+        pose = _at_rest(self.pose.relative_to(part_from_world), self.holds, blend, grasps)
         field = ObjectField(_in_part(thing, self.object_from_part))
         passed = _passed(thing, self.holds)
         return _Start(self.track, self.skin, pose, self.holds, part_from_world, field, self.part, passed)
@@ -387,7 +387,7 @@ def _leading(wanted: np.ndarray, most: int) -> int:
     return int(np.append(wanted[:most], False).argmin())
 
 
-def _grip(pair: HandPair, side: Side, clip: Clip, settings: HoldSettings, part: int | None = None) -> _Grip | None:
+def _grip(pair: HandPair, side: Side, clip: Clip, settings: GraspSettings, part: int | None = None) -> _Grip | None:
     """None for a hand that holds nothing. part: the one it is to hold, else the one it touches most."""
     track, thing = clip.hands[side], clip.object
     if not track.valid.any():
@@ -415,7 +415,11 @@ def _in_part(thing: ObjectTrack, object_from_part: RigidTransform) -> ObjectTrac
 
 
 def _holds(
-    points_m: np.ndarray, touching: np.ndarray, world_from_part: RigidTransform, valid: np.ndarray, own: HoldSettings
+    points_m: np.ndarray,
+    touching: np.ndarray,
+    world_from_part: RigidTransform,
+    valid: np.ndarray,
+    own: GraspSettings,
 ) -> tuple[list[Interval], np.ndarray]:
     """Intervals in which a hand, vertices (frame, vertex, 3) world, touches (frame,) a part and hardly moves on it; and
     (frame - 1,) whether the part moves under it.

@@ -14,7 +14,7 @@ from hoidata.clips.clip import HandTrack, ObjectTrack
 from hoidata.errors import BadInput
 from hoidata.hands.model import HandModel, HandPair, Side
 from hoidata.refinement.banded import acceleration_equations, minimize_banded, second_differences
-from hoidata.refinement.fitting import GeneratedHand, check_generated, pose_prior
+from hoidata.refinement.fitting import GeneratedKeypoints, check_generated, pose_prior
 from hoidata.refinement.kernels import N_UNKNOWNS, add_squares
 from hoidata.refinement.object_field import ObjectField
 from hoidata.refinement.skin import HandPose, SkinnedHand
@@ -42,7 +42,7 @@ class RefinementSettings:
 def refine_hands(
     pair: HandPair,
     keypoint_ids: np.ndarray,
-    generated: Mapping[Side, GeneratedHand],
+    generated: Mapping[Side, GeneratedKeypoints],
     tracks: Mapping[Side, HandTrack],
     object_track: ObjectTrack,
     settings: RefinementSettings = RefinementSettings(),
@@ -93,7 +93,7 @@ class _HandRefiner:
         self,
         model: HandModel,
         ids: np.ndarray,
-        hand: GeneratedHand,
+        hand: GeneratedKeypoints,
         track: HandTrack,
         field: ObjectField,
         settings: RefinementSettings,

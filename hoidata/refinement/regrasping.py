@@ -15,7 +15,7 @@ from hoidata.physics.capsules import Capsules
 from hoidata.refinement.grasp_solver import Attraction, GraspObjective, SolverSettings, solve_each_frame
 from hoidata.refinement.object_field import ObjectField
 from hoidata.refinement.skin import HandPose, SkinnedHand
-from hoidata.settings import at_least
+from hoidata.settings import require_at_least
 
 _OPPOSED = [JOINT_NAMES.index(name) for name in ("index3", "middle3", "thumb3")]
 _MOST_OPEN = 1.1  # of its own fingers' bends a hand that closes again begins with up to so many
@@ -23,7 +23,7 @@ _AT_ONCE = 32  # hands; bounds memory, changes nothing
 
 
 @dataclass(frozen=True)
-class RegraspSettings:
+class GraspSearchSettings:
     """Alternative grasp search: how grasps are sampled, closed and accepted."""
 
     tries: int = 192  # sampled hands; 0 disables the search
@@ -41,7 +41,7 @@ class RegraspSettings:
     blend: int = 16  # frames in which a hand comes to another grasp, and leaves it
 
     def __post_init__(self) -> None:
-        at_least("hold.regrasp", self, "tries", 0)
+        require_at_least("hold.regrasp", self, "tries", 0)
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class Held:
     other: Capsules | None
 
 
-def grasps_that_carry(
-    held: Held, carries: Callable[[HandPose], bool], solver: SolverSettings, settings: RegraspSettings
+def search_grasps(
+    held: Held, carries: Callable[[HandPose], bool], solver: SolverSettings, settings: GraspSearchSettings
 ) -> Iterator[HandPose]:
     """Hands (1 frame), those whose skin has moved least first.
 
@@ -90,7 +90,7 @@ def bends_rad(pose: HandPose) -> np.ndarray:
     return np.linalg.norm(pose.fingers, axis=-1).max(axis=1)
 
 
-def _closed(held: Held, hands: HandPose, solver: SolverSettings, settings: RegraspSettings) -> HandPose:
+def _closed(held: Held, hands: HandPose, solver: SolverSettings, settings: GraspSearchSettings) -> HandPose:
     """The hands, each drawn to the object by itself."""
     frames = np.full(len(hands.wrist_m), held.frame)
     other = None if held.other is None else held.other.taken(np.zeros_like(frames))
@@ -102,7 +102,7 @@ def _closed(held: Held, hands: HandPose, solver: SolverSettings, settings: Regra
     return solve_each_frame(wishes, settings.steps)
 
 
-def _hands_near(held: Held, settings: RegraspSettings) -> HandPose:
+def _hands_near(held: Held, settings: GraspSearchSettings) -> HandPose:
     """Hands to be closed, the same ones every time."""
     rng, count = np.random.default_rng(0), settings.tries
     own = held.pose.taken(np.zeros(count, int))

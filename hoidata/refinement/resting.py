@@ -16,7 +16,7 @@ _ENOUGH = 500  # vertices tell whether a rigid body moves
 
 
 @dataclass(frozen=True)
-class RestSettings:
+class RestingSettings:
     """What counts as at rest, and which heights are corrected."""
 
     still_m_s: float = 0.03  # an object slower than this at an end of the clip is at rest
@@ -26,7 +26,7 @@ class RestSettings:
     through_m: float = 0.08  # an object that goes lower than this below both ends was held at both ends; unchanged
 
 
-def rest_object(clip: Clip, settings: RestSettings = RestSettings()) -> Clip:
+def snap_to_rest(clip: Clip, settings: RestingSettings = RestingSettings()) -> Clip:
     """Raise or lower each frame of a clip, so that the object rests at the height it started from.
 
     A clip without known gravity, or with an object in motion at the start, is unchanged.
@@ -49,7 +49,7 @@ def _resting(still: np.ndarray, lowest_m: np.ndarray, drift_m: float) -> int:
     return int(np.append(still & near, False).argmin())
 
 
-def _rises(lowest_m: np.ndarray, first: int, last: int, settings: RestSettings) -> np.ndarray:
+def _rises(lowest_m: np.ndarray, first: int, last: int, settings: RestingSettings) -> np.ndarray:
     """(frame,) metres to raise: to the first height at both ends, and between them as far as it is below."""
     n_frames, too_low = len(lowest_m), lowest_m[0] - lowest_m
     rises, stop = np.zeros(n_frames), n_frames - last

@@ -43,7 +43,7 @@ class HandPose(NamedTuple):
         fingers = (nearest_rotvec(other.fingers, self.fingers) - self.fingers).reshape(len(rotation), -1)
         return np.concatenate((other.wrist_m - self.wrist_m, rotation, fingers), 1)
 
-    def seen_from(self, a_from_world: RigidTransform) -> "HandPose":
+    def relative_to(self, a_from_world: RigidTransform) -> "HandPose":
         """The same hand in frame of reference a; ``a_from_world``: (frame,) transforms."""
         wrist = (a_from_world @ self.wrist_m[:, None])[:, 0]
         return HandPose(wrist, a_from_world.rotation @ self.orient, self.fingers)

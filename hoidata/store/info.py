@@ -57,7 +57,7 @@ def store_info(
     }
 
 
-def stand_in_note(info: Mapping[str, Any]) -> str:
+def embedded_hand_warning(info: Mapping[str, Any]) -> str:
     """Return a warning if MANO parameters were converted with the embedded hand; else "".
 
     Generated raw files and fitted hands are exact with the embedded hand, so they give no warning.

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from hoidata.clips.clip import SIDES, ObjectTrack, SourceFile
-from hoidata.clips.recording import HandRecording, OwnHandTrack
+from hoidata.clips.recording import HandRecording, SourceHandTrack
 from hoidata.files import canonical_json, sha256_bytes
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import JointCapsules, Skin, TrackedHand
@@ -77,7 +77,7 @@ def read_recording(
         sequence=sequence,
         fps=facts["fps"],
         hand=hand,
-        hands={side: OwnHandTrack(members[f"{side}_wrist_m"], members[f"{side}_rotvec"]) for side in SIDES},
+        hands={side: SourceHandTrack(members[f"{side}_wrist_m"], members[f"{side}_rotvec"]) for side in SIDES},
         object=ObjectTrack(model, members["object_rotvec"], members["object_translation_m"], hinge),
         usable=members["usable"],
         gravity=np.array(facts["gravity"]),

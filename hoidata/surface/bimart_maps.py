@@ -14,14 +14,14 @@ from numba import njit
 
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import SampledPoints
-from hoidata.surface.contact import PlacedHand
+from hoidata.surface.contact import HandInObjectFrame
 
 REACH_M = 0.2
 STEP_M = 0.0008  # of a packed map
 BEYOND = 255  # packed value beyond REACH_M
 
 
-def bimart_map(hand: PlacedHand, points: SampledPoints, model: ObjectModel) -> np.ndarray:
+def bimart_map(hand: HandInObjectFrame, points: SampledPoints, model: ObjectModel) -> np.ndarray:
     """Distance from each sampled point to the nearest vertex of one hand.
 
     Args:
@@ -38,7 +38,7 @@ def bimart_map(hand: PlacedHand, points: SampledPoints, model: ObjectModel) -> n
         members = np.flatnonzero(points.part == part)
         cloud = np.ascontiguousarray(points.points_m[members].T, np.float32)
         nearest[:, members] = _nearest_m(np.ascontiguousarray(positions.transpose(0, 2, 1), np.float32), cloud)
-    return hand.over_clip(nearest, np.inf)
+    return hand.expand_to_clip(nearest, np.inf)
 
 
 def packed_map(distances_m: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from hoidata.hands import HandPair, track_joints
 from hoidata.objects.sampling import SampledPoints
 from hoidata.objects.surface_index import surface_index
 from hoidata.surface.bimart_maps import bimart_map
-from hoidata.surface.contact import deepest_m, placed_hand, touched_vertices
+from hoidata.surface.contact import deepest_m, hand_in_object_frame, touched_vertices
 
 
 class SideSurface(NamedTuple):
@@ -33,12 +33,12 @@ def measure_hand(clip: Clip, side: Side, hands: HandPair, points: SampledPoints)
     Raises:
         BadInput: the mesh has no triangles.
     """
-    index, hand = surface_index(clip.object.model), placed_hand(clip, side, hands)
+    index, hand = surface_index(clip.object.model), hand_in_object_frame(clip, side, hands)
     joints_m = track_joints(clip.hands[side], hands[side]).astype(np.float64)
     joints_m = (clip.object.world_from_object.inverse() @ joints_m)[hand.frames]
     return SideSurface(
         touched=touched_vertices(hand, index),
         depth_m=deepest_m(hand, index) if index.is_solid else np.full(clip.n_frames, np.nan),
-        joint_m=hand.over_clip(index.distance_m(joints_m, hand.hinge_rad).min(axis=1), np.inf),
+        joint_m=hand.expand_to_clip(index.distance_m(joints_m, hand.hinge_rad).min(axis=1), np.inf),
         map_m=bimart_map(hand, points, clip.object.model),
     )

@@ -11,7 +11,7 @@ from hoidata.physics.contact_forces import RESIDUAL_LIMIT
 from hoidata.synthetic.corpus import AnySize, datasets_of, make_corpus
 from hoidata.synthetic.soundness import measure, residuals_without_contact
 from hoidata.synthetic.truth import TruthSequence
-from hoidata.workers import in_workers
+from hoidata.workers import map_in_workers
 
 SHIFT_M = 0.010
 _DIRECTIONS_SEED = 7
@@ -67,7 +67,7 @@ def explained_by_verb(verbs: list[str], lengths: list[int]) -> float:
 
 def check_sequences(sequences: list[TruthSequence], jobs: int = 1) -> pd.DataFrame:
     """Return one row per dataset: percentage of lifted frames that pass, extremes in mm, controls, clip lengths."""
-    metrics: list[SequenceMetrics] = [result for _, result in in_workers(sequence_metrics, sequences, jobs)]
+    metrics: list[SequenceMetrics] = [result for _, result in map_in_workers(sequence_metrics, sequences, jobs)]
     datasets = dict.fromkeys(truth.dataset for truth in sequences)
     return pd.DataFrame(
         [_dataset_metrics(dataset, [item for item in metrics if item.dataset == dataset]) for dataset in datasets]

@@ -19,7 +19,7 @@ from hoidata.synthetic.truth import TruthSequence
 from hoidata.synthetic.write_arctic import write_arctic_meta, write_arctic_sequence
 from hoidata.synthetic.write_grab import write_grab_meshes, write_grab_sequence
 from hoidata.synthetic.write_h2o import write_h2o_objects_and_lists, write_h2o_sequence
-from hoidata.workers import in_workers
+from hoidata.workers import map_in_workers
 
 # "full" and "small" are the embedded corpora; "study" and "study-small" are the corpus ``study``.
 AnySize = Size | StudySize
@@ -58,7 +58,7 @@ def write_corpus(
         sequences = make_corpus(dataset, seed, size, jobs, progress)
         write_shared_files(dataset, partial_root, sequences, size)
         groups = by_raw_sequence(sequences)
-        writing = in_workers(partial(write_raw_sequence, dataset, partial_root), groups, jobs)
+        writing = map_in_workers(partial(write_raw_sequence, dataset, partial_root), groups, jobs)
         list(progress.track(writing, len(groups), description=f"{dataset}: writing"))
     return sequences
 
@@ -72,7 +72,7 @@ def make_corpus(
     """
 
     def run(function: Callable, tasks: Sequence, step: str) -> Iterable[tuple]:
-        results = in_workers(function, tasks, jobs)
+        results = map_in_workers(function, tasks, jobs)
         return results if progress is None else progress.track(results, len(tasks), description=f"{dataset}: {step}")
 
     if size in ("full", "small"):

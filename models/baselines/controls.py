@@ -14,7 +14,7 @@ from hoidata.objects.model import articulate
 from hoidata.store.annotated import AnnotatedStore
 from models.baselines.families import GroundTruth
 from models.baselines.retrieval import Retrieval, of_the_hand, retrieval_clips
-from models.common.family import EachAlone, Family, LeftOut, Sources
+from models.common.family import Family, SingleRequestSampler, Skipped, Sources
 
 OBJECT_MOVED_M = 0.10
 # From a joint to a sampled point: 2 cm of air plus the radius of a finger.
@@ -39,7 +39,7 @@ class PerturbedRecording:
     perturb: Callable[[Clip, "Recording"], Clip | str]  # returns the reason if a clip cannot be perturbed
     differs_per_motion: bool  # the perturbation is random, with the seed of the motion
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
+    def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
         perturbed = dict[str, Clip | str]()
         for request in requests:
             key = self._key(request)
@@ -47,7 +47,7 @@ class PerturbedRecording:
                 perturbed[key] = self.perturb(self.truth.recorded(request), Recording(self.truth.annotated, request))
         return [_answer(request, perturbed[self._key(request)]) for request in requests]
 
-    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip | LeftOut], list[np.ndarray]]:
+    def sample_with_targets(self, requests: Sequence[Request]) -> tuple[list[Clip | Skipped], list[np.ndarray]]:
         return self.sample(requests), self.truth.contact_maps(requests)
 
     def _key(self, request: Request) -> str:
@@ -81,9 +81,9 @@ class Recording:
         return clip.object.take(frames).world_from_object.inverse() @ joints_m
 
 
-def _answer(request: Request, perturbed: Clip | str) -> Clip | LeftOut:
+def _answer(request: Request, perturbed: Clip | str) -> Clip | Skipped:
     motion_id = request.motion_id
-    return LeftOut(motion_id, perturbed) if isinstance(perturbed, str) else replace(perturbed, clip_id=motion_id)
+    return Skipped(motion_id, perturbed) if isinstance(perturbed, str) else replace(perturbed, clip_id=motion_id)
 
 
 def static(clip: Clip, recording: Recording) -> Clip | str:
@@ -156,15 +156,15 @@ def noisy(clip: Clip, recording: Recording) -> Clip:
 
 
 @dataclass(frozen=True)
-class OtherHands(EachAlone):
+class OtherHands(SingleRequestSampler):
     """Combines the recorded object motion with the hands of a retrieved training clip."""
 
     truth: GroundTruth
     retrieval: Retrieval
 
-    def motion(self, request: Request) -> Clip | LeftOut:
+    def motion(self, request: Request) -> Clip | Skipped:
         retrieved = self.retrieval.motion(request)
-        if isinstance(retrieved, LeftOut):
+        if isinstance(retrieved, Skipped):
             return retrieved
         return replace(retrieved, object=self.truth.recorded(request).object)
 

@@ -12,7 +12,7 @@ from hoidata.clips.clip import Clip
 from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from hoidata.store.annotated import AnnotatedStore
 from models.baselines.retrieval import matched_rows, train_clips
-from models.common.family import EachAlone, Family, LeftOut, motion_clip
+from models.common.family import Family, SingleRequestSampler, Skipped, motion_clip
 from models.common.features import proper_hands, proper_object
 
 TIME_BINS = 50
@@ -28,7 +28,7 @@ class GroundTruth:
     def sample(self, requests: Sequence[Request]) -> list[Clip]:
         return [self.recorded(request) for request in requests]
 
-    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
+    def sample_with_targets(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
         return self.sample(requests), self.contact_maps(requests)
 
     def contact_maps(self, requests: Sequence[Request]) -> list[np.ndarray]:
@@ -48,7 +48,7 @@ class GroundTruth:
 
 
 @dataclass(frozen=True)
-class MeanMotion(EachAlone):
+class MeanMotion(SingleRequestSampler):
     """The mean of the training clips per bin of normalised time; one bin gives the mean pose."""
 
     hands: np.ndarray  # (2, bin, 99) features in the model frame
@@ -79,9 +79,9 @@ class MeanMotion(EachAlone):
             hand_weights[:, :, 0].sum(axis=1) > 0,
         )
 
-    def motion(self, request: Request) -> Clip | LeftOut:
+    def motion(self, request: Request) -> Clip | Skipped:
         if (request.active_hands & ~self.has_mean).any():
-            return LeftOut(request.motion_id, NO_MEAN)
+            return Skipped(request.motion_id, NO_MEAN)
         rows = matched_rows(request.n_frames, len(self.objects))
         hands, objects = torch.from_numpy(self.hands[:, rows]), torch.from_numpy(self.objects[rows])
         return motion_clip(request, proper_hands(hands), proper_object(objects), self.synthetic)

@@ -11,13 +11,13 @@ from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.store.annotated import AnnotatedStore
-from models.common.family import EachAlone, Family, LeftOut, Sources, motion_clip
+from models.common.family import Family, SingleRequestSampler, Skipped, Sources, motion_clip
 
 Train = Sequence[ClipSample]
 
 
 @dataclass(frozen=True)
-class Retrieval(EachAlone):
+class Retrieval(SingleRequestSampler):
     """Answers motion k of a request with the k-th training clip of a ranking.
 
     The motion is stretched to the requested length and applied to the requested object.
@@ -28,11 +28,11 @@ class Retrieval(EachAlone):
     kind: str = ""  # the clips that ``rank`` looks for, in words
     use_retrieved_hands: bool = False  # move the hands of the retrieved clip, not only the requested ones
 
-    def motion(self, request: Request) -> Clip | LeftOut:
+    def motion(self, request: Request) -> Clip | Skipped:
         """The retrieved motion, or the reason if no clip matches."""
         indices = self.rank(self.train, request) if len(self.train) else []
         if not len(indices):
-            return LeftOut(request.motion_id, f"no training clip {self.kind}")
+            return Skipped(request.motion_id, f"no training clip {self.kind}")
         retrieved = self.train[indices[request.number % len(indices)]]
         frames = matched_rows(request.n_frames, retrieved.length)
         hands, objects = torch.from_numpy(retrieved.hands[:, frames]), torch.from_numpy(retrieved.object[frames])
@@ -124,9 +124,9 @@ def _family(name: str, title: str, load: Callable[[Train, Prompt], Retrieval]) -
 
 
 NEAREST_CLIP = _family("nearest-clip", "retrieval by sentence", lambda train, prompt: Retrieval(train, by_sentence))
-PROMPT_LOOKUP = _family("prompt-lookup", "retrieval by prompt", lambda train, prompt: Retrieval(train, prompt.same))
+PROMPT_LOOKUP = _family("prompt-retrieval", "retrieval by prompt", lambda train, prompt: Retrieval(train, prompt.same))
 VERB_LOOKUP = _family(
-    "verb-lookup",
+    "verb-retrieval",
     "retrieval by verb",
     lambda train, prompt: Retrieval(train, prompt.same_verb, "of this hand with this verb"),
 )

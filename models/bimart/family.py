@@ -16,8 +16,8 @@ from hoidata.clips.features import GLOBAL_ORIENT_6D, HAND_FEATURES
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import HandPair
 from hoidata.hands.model import N_VERTICES
-from hoidata.metrics.target_contact import AskedDistances
-from hoidata.refinement import GeneratedHand, RefinementSettings, fit_hands, refine_hands
+from hoidata.metrics.target_contact import TargetDistances
+from hoidata.refinement import GeneratedKeypoints, RefinementSettings, fit_hands, refine_hands
 from hoidata.sensors.part_bps import distance_map
 from hoidata.settings import build_config
 from hoidata.store.annotated import AnnotatedStore
@@ -26,7 +26,7 @@ from models.bimart.sampler import BimArt, SampledMotion, SamplingTask, preset_of
 from models.bimart.scene import FeatureConfig, RecordedClip, Scene, recorded_clip
 from models.bimart.training import CONTACT, MOTION
 from models.common.checkpoints import load_checkpoint
-from models.common.family import Family, Figures, LeftOut, Sources, motion_clip, refuse_not_finite
+from models.common.family import Family, Figures, Skipped, Sources, motion_clip, refuse_not_finite
 
 NO_OBJECT_MOTION = "this method needs the motion of an object, and the request has none"
 NO_OTHER = {"other path": "no training clip of its object", "other object": "all training clips are of its object"}
@@ -46,7 +46,7 @@ class FamilyConfig:
 
 
 @dataclass(frozen=True)
-class HandsForPaths:
+class BimArtSampler:
     """The trained networks of one dataset with their hand model, as a sampler of clips."""
 
     model: BimArt
@@ -57,7 +57,7 @@ class HandsForPaths:
     annotated: AnnotatedStore | None = None  # the dataset, for negative controls
 
     @classmethod
-    def load(cls, sources: Sources, refined: bool = True, change: Change = "none") -> "HandsForPaths":
+    def load(cls, sources: Sources, refined: bool = True, change: Change = "none") -> "BimArtSampler":
         """Load both checkpoints and the settings ``sample.bimart``."""
         config = build_config(FamilyConfig, sources.settings.get("bimart"), "params.yaml: sample.bimart")
         motion = load_checkpoint(sources.checkpoints / MOTION.name, MOTION, sources.device)
@@ -74,10 +74,12 @@ class HandsForPaths:
             annotated=sources.annotated,
         )
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
-        return self.sample_asked(requests)[0]
+    def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
+        return self.sample_with_targets(requests)[0]
 
-    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip | LeftOut], list[AskedDistances | None]]:
+    def sample_with_targets(
+        self, requests: Sequence[Request]
+    ) -> tuple[list[Clip | Skipped], list[TargetDistances | None]]:
         """Sample motions with their target contact maps.
 
         Returns:
@@ -88,10 +90,10 @@ class HandsForPaths:
         motions: dict[int, SampledMotion] = {}  # by number of the request
         for batch in self._batches(requests):
             motions |= zip(batch, self.sample_motions([requests[number] for number in batch]), strict=True)
-        answers: list[Clip | LeftOut] = [
+        answers: list[Clip | Skipped] = [
             self.clip(request, motions[number])
             if number in motions
-            else LeftOut(request.motion_id, self._why_not(request))
+            else Skipped(request.motion_id, self._why_not(request))
             for number, request in enumerate(requests)
         ]
         has_target = self.change in ("none", "zero map")
@@ -144,7 +146,7 @@ class HandsForPaths:
             return Scene.of(request.object, other.object[rows], basis)
         return Scene.of(other.object_model, object_features, basis)
 
-    def contact_target(self, request: Request, motion: SampledMotion) -> AskedDistances:
+    def contact_target(self, request: Request, motion: SampledMotion) -> TargetDistances:
         """The target contact map of a motion, object frame; NaN for inactive hands."""
         scene, features = self._scene(request), self.model.motion.config.features
         points_m = scene.object_from_canonical @ scene.object_point_m.astype(np.float64)
@@ -152,15 +154,15 @@ class HandsForPaths:
         distance_m = np.where(mask, motion.contact_m, np.nan).reshape(len(points_m), 2, -1)
         keypoint_ids = self.model.motion.keypoint_ids.cpu().numpy()
         hand_vertices = np.arange(N_VERTICES) if features.contact_map_target == "skin" else keypoint_ids
-        return AskedDistances(points_m.astype(np.float32), distance_m, hand_vertices)
+        return TargetDistances(points_m.astype(np.float32), distance_m, hand_vertices)
 
-    def keypoints_in_world(self, request: Request, motion: SampledMotion) -> dict[Side, GeneratedHand]:
+    def keypoints_in_world(self, request: Request, motion: SampledMotion) -> dict[Side, GeneratedKeypoints]:
         """Keypoints and vectors to the object in the world, of active hands."""
         world = world_from_canonical(request, self._requested_scene(request))
         # The fit reads a NaN keypoint as a frame without this hand, so non-finite values must be refused here.
         refuse_not_finite(request, motion.keypoints_m[request.active_hands], motion.to_object_m[request.active_hands])
         return {
-            side: GeneratedHand(
+            side: GeneratedKeypoints(
                 world @ motion.keypoints_m[side_index].astype(np.float64),
                 world.turn(motion.to_object_m[side_index].astype(np.float64)),
                 motion.active[side_index],
@@ -220,7 +222,7 @@ def diagnose(sources: Sources) -> Figures:
         bimart-motion: error of the keypoints sampled for the recorded map, and the difference between their contact map
         and that map.
     """
-    model = HandsForPaths.load(sources).model
+    model = BimArtSampler.load(sources).model
     features = model.motion.config.features
     test_clips = list(HoiDataset(sources.annotated, "test", crop="start"))
     chosen = test_clips[:: -(-len(test_clips) // DIAGNOSED_CLIPS)]
@@ -277,7 +279,7 @@ def _family(name: str, title: str, refined: bool = True, change: Change = "none"
     return Family(
         name,
         title,
-        lambda sources: HandsForPaths.load(sources, refined, change),
+        lambda sources: BimArtSampler.load(sources, refined, change),
         networks=(CONTACT, MOTION) if name == "bimart" else (),
         uses=(CONTACT.name, MOTION.name),
         diagnose=diagnose if name == "bimart" else lambda sources: {},

@@ -2,7 +2,7 @@
 
 path = keyframed_path(model, read_keyframes("keys.csv"))
 sampler = load_family("bimart").load(Sources(...))
-motions = hands_for(sampler, path.track, MotionWish(seed=1, samples=2))
+motions = hands_for(sampler, path.track, HandSamplingOptions(seed=1, samples=2))
 """
 
 from dataclasses import dataclass, field, replace
@@ -19,7 +19,7 @@ from hoidata.hands import track_vertices
 from hoidata.objects.sampling import SampledPoints, sample_points
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.part_bps import distance_map
-from models.bimart.family import HandsForPaths
+from models.bimart.family import BimArtSampler
 from models.bimart.sampler import SampledMotion
 from models.bimart.scene import Scene
 
@@ -29,7 +29,7 @@ DOWN = (0.0, 0.0, -1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class MotionWish:
+class HandSamplingOptions:
     """Options of ``hands_for``."""
 
     seed: int = 0  # of all random numbers
@@ -42,7 +42,7 @@ class MotionWish:
 
 
 @dataclass(frozen=True)
-class Standing:
+class ContactMeasures:
     """Contact and smoothness measures of a motion."""
 
     touching: dict[Side, np.ndarray]  # by active hand: (frame,) bool, some vertex within 5 mm of the surface
@@ -51,7 +51,7 @@ class Standing:
 
 
 @dataclass(frozen=True, eq=False)
-class MadeHands:
+class SampledHands:
     """One sampled motion, before and after refinement."""
 
     clip: Clip
@@ -59,13 +59,15 @@ class MadeHands:
     points: SampledPoints
     reached_m: np.ndarray  # (2, frame, point) distance from each point to the nearest vertex of each hand
     asked_m: np.ndarray  # (2, point) target distance of the contact map, least over all frames; inf: not in the map
-    standing: Standing
-    standing_before: Standing  # of ``before``
+    standing: ContactMeasures
+    unrefined_measures: ContactMeasures  # of ``before``
     seed: int
     number: int
 
 
-def hands_for(sampler: HandsForPaths, object_track: ObjectTrack, options: MotionWish = MotionWish()) -> list[MadeHands]:
+def hands_for(
+    sampler: BimArtSampler, object_track: ObjectTrack, options: HandSamplingOptions = HandSamplingOptions()
+) -> list[SampledHands]:
     """Sample motions of both hands, or one, for an object motion.
 
     Raises:
@@ -81,7 +83,7 @@ def hands_for(sampler: HandsForPaths, object_track: ObjectTrack, options: Motion
     return [_sample_motion(sampler, object_track, request, points) for request in requests]
 
 
-def contact_measures(clip: Clip, sampler: HandsForPaths) -> Standing:
+def contact_measures(clip: Clip, sampler: BimArtSampler) -> ContactMeasures:
     """Measure a clip with exact distances to the object's surface."""
     object_track, index = clip.object, surface_index(clip.object.model)
     touching, depths_m, accelerations = {}, [], []
@@ -97,10 +99,10 @@ def contact_measures(clip: Clip, sampler: HandsForPaths) -> Standing:
             depths_m.append(index.depth_m(vertices_object_m, object_track.hinge_rad).max(axis=1))
         accelerations.append(np.linalg.norm(np.diff(vertices_m, 2, axis=0), axis=-1).mean() * FPS**2)
     deepest_m = np.max(depths_m, axis=0) if depths_m else None
-    return Standing(touching, deepest_m, float(np.mean(accelerations)))
+    return ContactMeasures(touching, deepest_m, float(np.mean(accelerations)))
 
 
-def _request(object_track: ObjectTrack, options: MotionWish, points: SampledPoints, number: int) -> Request:
+def _request(object_track: ObjectTrack, options: HandSamplingOptions, points: SampledPoints, number: int) -> Request:
     seed_text = f"{options.seed} {number} {object_track.model.name}"
     model_from_world, origin = upright(options.gravity), np.asarray(object_track.translation_m[0], np.float64)
     world_from_model = np.eye(4)
@@ -124,8 +126,8 @@ def _request(object_track: ObjectTrack, options: MotionWish, points: SampledPoin
 
 
 def _sample_motion(
-    sampler: HandsForPaths, object_track: ObjectTrack, request: Request, points: SampledPoints
-) -> MadeHands:
+    sampler: BimArtSampler, object_track: ObjectTrack, request: Request, points: SampledPoints
+) -> SampledHands:
     motion = sampler.sample_motions([request])[0]
     unrefined_sampler = replace(sampler, config=replace(sampler.config, refined=False))
     # Features are float32: the clips get the given track instead of the one read from features.
@@ -139,21 +141,21 @@ def _sample_motion(
             distance_m[side_index] = distance_map(
                 points_world_m, track_vertices(refined_clip.hands[side], sampler.pair[side])
             )
-    return MadeHands(
+    return SampledHands(
         clip=refined_clip,
         before=unrefined_clip,
         points=points,
         reached_m=distance_m,
         asked_m=_target_distances(sampler, request, motion, points_world_m),
         standing=contact_measures(refined_clip, sampler),
-        standing_before=contact_measures(unrefined_clip, sampler),
+        unrefined_measures=contact_measures(unrefined_clip, sampler),
         seed=request.seed,
         number=request.number,
     )
 
 
 def _target_distances(
-    sampler: HandsForPaths, request: Request, motion: SampledMotion, points_m: np.ndarray
+    sampler: BimArtSampler, request: Request, motion: SampledMotion, points_m: np.ndarray
 ) -> np.ndarray:
     """(2, point) least target distance over the contact map's object points that are nearest to each sampled point.
 

@@ -13,14 +13,14 @@ from hoidata.clips.features import GLOBAL_ORIENT_6D, HAND_FEATURES, WRIST
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import HandPair
-from hoidata.refinement import GeneratedHand, fit_hands, refine_hands
+from hoidata.refinement import GeneratedKeypoints, fit_hands, refine_hands
 from hoidata.sensors.keypoints import hand_keypoints
 from hoidata.sensors.part_bps import BasisSettings
 from models.baselines.families import NO_MEAN
 from models.bimart.family import clip_without_hands, training_clips, world_from_canonical
 from models.bimart.sampler import MAX_ACTIVE_M
 from models.bimart.scene import FeatureConfig, RecordedClip, Scene, recorded_clip
-from models.common.family import EachAlone, Family, LeftOut, Sources, motion_clip
+from models.common.family import Family, SingleRequestSampler, Skipped, Sources, motion_clip
 from models.common.features import proper_hands
 
 BASIS = BasisSettings(64, nearest="vertex", frame="base")
@@ -62,7 +62,7 @@ class TrainingClip(NamedTuple):
 
 
 @dataclass(frozen=True)
-class NearestWindow(EachAlone):
+class NearestWindow(SingleRequestSampler):
     """Copies the hands of the nearest training window with the same active hands, for each window of a request."""
 
     clips: dict[ActiveHands, list[TrainingClip]]
@@ -90,9 +90,9 @@ class NearestWindow(EachAlone):
             clips.setdefault(active_hands_of(sample), []).append(clip)
         return cls(clips, mean, std, any(sample.synthetic for sample in samples))
 
-    def motion(self, request: Request) -> Clip | LeftOut:
+    def motion(self, request: Request) -> Clip | Skipped:
         if request.trajectories is None or active_hands_of(request) not in self.clips:
-            return LeftOut(request.motion_id, NO_WINDOW)
+            return Skipped(request.motion_id, NO_WINDOW)
         object_features = request.trajectories.object[: request.n_frames]
         scene = Scene.of(request.object, object_features, BASIS)
         clips = self.clips[active_hands_of(request)]
@@ -121,7 +121,7 @@ class NearestWindow(EachAlone):
 
 
 @dataclass(frozen=True)
-class MeanPose(EachAlone):
+class MeanPose(SingleRequestSampler):
     """Places the mean training hand in the object's canonical frame."""
 
     hands: np.ndarray  # (2, 99) features
@@ -140,11 +140,11 @@ class MeanPose(EachAlone):
         hands = proper_hands(torch.from_numpy(total / count.clip(1))).numpy()
         return cls(hands, any(sample.synthetic for sample in samples), count[:, 0] > 0)
 
-    def motion(self, request: Request) -> Clip | LeftOut:
+    def motion(self, request: Request) -> Clip | Skipped:
         if request.trajectories is None:
-            return LeftOut(request.motion_id, "no motion of an object")
+            return Skipped(request.motion_id, "no motion of an object")
         if (request.active_hands & ~self.in_training).any():
-            return LeftOut(request.motion_id, NO_MEAN)
+            return Skipped(request.motion_id, NO_MEAN)
         object_features = request.trajectories.object[: request.n_frames]
         scene = Scene.of(request.object, object_features, BASIS)
         hands = np.repeat(self.hands[:, None], len(object_features), axis=1)
@@ -158,7 +158,7 @@ def active_hands_of(clip: Request | ClipSample) -> ActiveHands:
 
 
 @dataclass(frozen=True)
-class RefinedWindow(EachAlone):
+class RefinedWindow(SingleRequestSampler):
     """The nearest training window with the fit and refinement of BimArt: everything but the networks."""
 
     nearest: NearestWindow
@@ -169,16 +169,16 @@ class RefinedWindow(EachAlone):
     def load(cls, sources: Sources) -> "RefinedWindow":
         return cls(NearestWindow.load(sources), sources.hands)
 
-    def motion(self, request: Request) -> Clip | LeftOut:
+    def motion(self, request: Request) -> Clip | Skipped:
         if request.trajectories is None or active_hands_of(request) not in self.nearest.clips:
-            return LeftOut(request.motion_id, NO_WINDOW)
+            return Skipped(request.motion_id, NO_WINDOW)
         hands, ids = self._hands(request), hand_keypoints(self.pair.right, FEATURES.keypoints)
         clip = clip_without_hands(request, self.nearest.synthetic)
         tracks = fit_hands(self.pair, request.betas, ids, hands, request.template_m)
         tracks = refine_hands(self.pair, ids, hands, tracks, clip.object)
         return replace(clip, hands={**clip.hands, **tracks})
 
-    def _hands(self, request: Request) -> dict[Side, GeneratedHand]:
+    def _hands(self, request: Request) -> dict[Side, GeneratedKeypoints]:
         """Keypoints and vectors to the object of the nearest windows, world frame."""
         assert request.trajectories is not None
         scene = Scene.of(request.object, request.trajectories.object[: request.n_frames], BASIS)
@@ -188,7 +188,7 @@ class RefinedWindow(EachAlone):
         near = np.linalg.norm(to_object, axis=-1).min(axis=-1) < MAX_ACTIVE_M
         world = world_from_canonical(request, scene)
         return {
-            side: GeneratedHand(
+            side: GeneratedKeypoints(
                 world @ keypoints[side_index].astype(np.float64),
                 world.turn(to_object[side_index].astype(np.float64)),
                 near[side_index],

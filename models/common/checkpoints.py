@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from hoidata.errors import BadInput
 from hoidata.files import canonical_json, write_whole
-from hoidata.files.sealed import METADATA_KEY, OPEN_SEAL, check_seal, sealed
+from hoidata.files.checksums import EMPTY_CHECKSUMS, METADATA_KEY, sealed, verify_checksums
 from hoidata.files.written import EMPTY, empty_reason
 from hoidata.settings import build_config, plain_config
 from models.common.family import StoredNetwork
@@ -50,7 +50,7 @@ def save_checkpoint(
         tensors |= {_NORMALISER + name: tensor for name, tensor in normaliser.tensors().items()}
     tensors = {name: tensors[name].detach().cpu().contiguous() for name in sorted(tensors)}
     header = {"format": FORMAT, "model": model_name, "config": plain_config(network.config)}
-    metadata = {**header, **info, "seal": OPEN_SEAL}  # not the checksum of a file from which the facts were read
+    metadata = {**header, **info, "seal": EMPTY_CHECKSUMS}  # not the checksum of a file from which the facts were read
     return write_whole(
         Path(folder) / FILE_NAME, sealed(save(tensors, metadata={METADATA_KEY: canonical_json(metadata)}))
     )
@@ -83,7 +83,7 @@ def load_checkpoint(folder: str | Path, network: StoredNetwork, device: torch.de
     if not path.is_file():
         raise BadInput(path, "a trained model", empty_reason(path.parent) or "no file", "run `dvc repro`")
     info = read_info(path)
-    check_seal(path)
+    verify_checksums(path)
     if info.get("model") != network.name:
         remedy = "point to the right folder"
         raise BadInput(path, f"a checkpoint of {network.name}", f"one of {info.get('model')}", remedy)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, Crop, HoiDataset, collate
-from hoidata.batches.sight import Sight
+from hoidata.batches.frame_selection import FrameSelection
 from hoidata.devices import send
 from hoidata.files import canonical_json, sha256_bytes
 from hoidata.hands import HandPair
@@ -29,7 +29,7 @@ HAND_TYPES = ("left", "right", "both")
 class BatchSpec:
     """What batches contain."""
 
-    frames: int = 0  # selected frames per clip, for losses of geometry (``Sight``)
+    frames: int = 0  # selected frames per clip, for losses of geometry (``FrameSelection``)
     entries: int = 0  # distance entries per batch, for losses of geometry
     parts: Sequence[int] = (0,)  # numbers of the micro-batches of this process
     of: int = 1  # micro-batches of a batch, of all processes
@@ -123,7 +123,7 @@ def _collated(
         ]
     random = np.random.default_rng(seed)
     lengths = [sample.length for sample in samples]
-    sight = Sight.drawn(lengths, spec.frames, spec.entries, random) if spec.frames else None
+    sight = FrameSelection.drawn(lengths, spec.frames, spec.entries, random) if spec.frames else None
     return collate(samples, sight)
 
 

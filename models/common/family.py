@@ -103,7 +103,7 @@ class Sources:
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class Skipped:
     """A request that a family cannot answer."""
 
     clip_id: str  # of the requested motion
@@ -113,18 +113,18 @@ class LeftOut:
 class Sampler(Protocol):
     """A loaded family."""
 
-    def sample(self, requests: Sequence[Request]) -> Sequence[Clip | LeftOut]:
+    def sample(self, requests: Sequence[Request]) -> Sequence[Clip | Skipped]:
         """One answer per request, in order. An answer does not depend on the other requests."""
         ...
 
 
-class EachAlone:
+class SingleRequestSampler:
     """A sampler that answers requests one by one."""
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
+    def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
         return [self.motion(request) for request in requests]
 
-    def motion(self, request: Request) -> Clip | LeftOut:
+    def motion(self, request: Request) -> Clip | Skipped:
         """The answer to one request."""
         raise NotImplementedError
 

@@ -18,12 +18,12 @@ from hoidata.clips.clip import Clip
 from hoidata.clips.features import GLOBAL_ORIENT_6D
 from hoidata.files import atomic_folder, write_whole
 from hoidata.hands import HandPair
-from hoidata.metrics.target_contact import AskedDistances, write_asked, write_asked_distances
-from hoidata.settings import at_least, build_config
+from hoidata.metrics.target_contact import TargetDistances, write_target_contact, write_target_distances
+from hoidata.settings import build_config, require_at_least
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import write_store
 from models.common.checkpoints import FILE_NAME, empty_reason, write_empty
-from models.common.family import Family, LeftOut, Sampler, Sources
+from models.common.family import Family, Sampler, Skipped, Sources
 
 CLIPS_AT_ONCE = 32
 LEFT_OUT = "left_out.json"
@@ -39,19 +39,21 @@ class PredictionConfig:
     clips: int = 0  # evenly spaced test clips; 0: all
 
     def __post_init__(self) -> None:
-        at_least("sample", self, "samples", 1)
-        at_least("sample", self, "clips", 0)
+        require_at_least("sample", self, "samples", 1)
+        require_at_least("sample", self, "clips", 0)
 
 
 # The contact that a motion was conditioned on: (point,) bool touched points, distances to the hands, or None.
-ContactCondition = np.ndarray | AskedDistances | None
+ContactCondition = np.ndarray | TargetDistances | None
 
 
 @runtime_checkable
 class ReportsContact(Protocol):
     """A sampler that conditions motions on contact and reports it."""
 
-    def sample_asked(self, requests: Sequence[Request]) -> tuple[Sequence[Clip | LeftOut], Sequence[ContactCondition]]:
+    def sample_with_targets(
+        self, requests: Sequence[Request]
+    ) -> tuple[Sequence[Clip | Skipped], Sequence[ContactCondition]]:
         """As ``Sampler.sample``, with the contact that each motion was conditioned on (:data:`ContactCondition`)."""
         ...
 
@@ -96,7 +98,7 @@ def sample_family(
     sources = Sources(annotated, checkpoints, hands, device=torch.device(device), settings=settings or {})
     with atomic_folder(out) as partial:
         info = annotated.info | {"family": family.name, "sampling_device": sources.device.type}
-        left_out, contacts = list[LeftOut](), dict[str, np.ndarray | AskedDistances]()
+        left_out, contacts = list[Skipped](), dict[str, np.ndarray | TargetDistances]()
         motions = _motions_of(_motions(family.load(sources), test, config, contacts), left_out)
         first = next(motions, None)
         if first is None:
@@ -147,23 +149,23 @@ def first_sentence(sample: ClipSample) -> Sentence:
     return Sentence(sample.sentences[0], sample.verb, sample.object_words or None)
 
 
-def _write_asked(folder: Path, contacts: Mapping[str, np.ndarray | AskedDistances]) -> None:
+def _write_asked(folder: Path, contacts: Mapping[str, np.ndarray | TargetDistances]) -> None:
     """Write the contact conditions, each kind to its file, if there are any."""
-    distances = {name: contact for name, contact in contacts.items() if isinstance(contact, AskedDistances)}
+    distances = {name: contact for name, contact in contacts.items() if isinstance(contact, TargetDistances)}
     if touched := {name: contact for name, contact in contacts.items() if isinstance(contact, np.ndarray)}:
-        write_asked(folder, touched)
+        write_target_contact(folder, touched)
     if distances:
-        write_asked_distances(folder, distances)
+        write_target_distances(folder, distances)
 
 
 def _write(path: Path, values: Any) -> None:
     write_whole(path, json.dumps(values, indent=2, sort_keys=True) + "\n")
 
 
-def _motions_of(answers: Iterator[Clip | LeftOut], left_out: list[LeftOut]) -> Iterator[Clip]:
+def _motions_of(answers: Iterator[Clip | Skipped], left_out: list[Skipped]) -> Iterator[Clip]:
     """The motions among the answers; skipped requests are appended to ``left_out``."""
     for answer in answers:
-        if isinstance(answer, LeftOut):
+        if isinstance(answer, Skipped):
             left_out.append(answer)
         else:
             yield answer
@@ -173,15 +175,15 @@ def _motions(
     sampler: Sampler,
     test: Sequence[ClipSample],
     config: PredictionConfig,
-    contacts: dict[str, np.ndarray | AskedDistances],
-) -> Iterator[Clip | LeftOut]:
+    contacts: dict[str, np.ndarray | TargetDistances],
+) -> Iterator[Clip | Skipped]:
     """The answers in order; adds each motion's contact condition, if the family reports it, to ``contacts``."""
     starts = range(0, len(test), CLIPS_AT_ONCE)
     for start in track(starts, description="sampling", transient=True):
         chosen = test[start : start + CLIPS_AT_ONCE]
         requests = [request for sample in chosen for request in requests_for(sample, config)]
         if isinstance(sampler, ReportsContact):
-            answers, maps = sampler.sample_asked(requests)
+            answers, maps = sampler.sample_with_targets(requests)
             contacts |= {
                 answer.clip_id: contact_map
                 for answer, contact_map in zip(answers, maps, strict=True)

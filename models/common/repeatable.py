@@ -33,7 +33,7 @@ def restored_rng(device: torch.device | str = "cpu") -> Iterator[None]:
         yield
 
 
-def seed_draws(*words: int) -> torch.Generator:
+def seeded_generator(*words: int) -> torch.Generator:
     """A CPU generator seeded by ``words``, such as (seed, step, part); seeds torch's global generators as well."""
     seed = int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> np.uint64(1))
     torch.manual_seed(seed)

@@ -22,7 +22,7 @@ from hoidata.errors import BadInput
 from hoidata.files import atomic_folder, canonical_json, sha256_bytes, sha256_file
 from hoidata.files.written import EMPTY
 from hoidata.hands import HandPair
-from hoidata.settings import at_least, build_config, key_in_file, plain_config, refuse_unknown
+from hoidata.settings import build_config, check_keys, key_in_file, plain_config, require_at_least
 from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import (
     FILE_NAME,
@@ -37,7 +37,7 @@ from models.common.family import Network, Objective, Setup
 from models.common.features import Hands, Normaliser
 from models.common.precision import Precision, compute_in
 from models.common.progress import LOG_NAME, WEIGHTS, Diverged, Progress, Row, State, all_finite, write_log
-from models.common.repeatable import restored_rng, seed_draws
+from models.common.repeatable import restored_rng, seeded_generator
 from models.common.team import Team
 
 # Subfolder of the progress folder with the last good checkpoint of a training that diverged.
@@ -77,8 +77,8 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "validate_every", "micro_batches", "save_every"):
-            at_least("training", self, name, 1)
-        at_least("training", self, "augmented_copies", 0)
+            require_at_least("training", self, name, 1)
+        require_at_least("training", self, "augmented_copies", 0)
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class TrainingSpec:
         Raises BadInput for unknown keys.
         """
         section = f"params.yaml: {network.name}"
-        refuse_unknown(params, ("network", "training", "loss", "seed"), section)
+        check_keys(params, ("network", "training", "loss", "seed"), section)
         network_key, training_key, loss_key = (
             key_in_file(params, name, section) for name in ("network", "training", "loss")
         )
@@ -162,7 +162,7 @@ def train_network(
     pair, torch_device = annotated.store.hand_pair(), torch.device(device)
     trained = {other.name: load_checkpoint(folder, other, torch_device) for other, folder in needed.items()}
     with restored_rng(torch_device):
-        seed_draws(spec.seed)
+        seeded_generator(spec.seed)
         setup = Setup(
             network=spec.network,
             loss=spec.loss,
@@ -339,7 +339,7 @@ def _add_gradients(
         for buffer, old in zip(buffers, before, strict=True):
             # Batch-norm statistics start equal for every micro-batch.
             buffer.copy_(old)
-        terms = objective.losses(batch.to(device), seed_draws(seed, step, part))
+        terms = objective.losses(batch.to(device), seeded_generator(seed, step, part))
         (terms["total"] / of).backward()
         for total, buffer in zip(after, statistics, strict=True):
             total += buffer / of

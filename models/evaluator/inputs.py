@@ -18,7 +18,7 @@ from hoidata.actions.action import verb_of
 from hoidata.clips.clip import SIDES, Side
 from hoidata.clips.features import OBJECT_ROTATION_6D, object_features, upright
 from hoidata.files import canonical_json
-from hoidata.geometry.rotations import rot6d_to_rotmat, turns_about
+from hoidata.geometry.rotations import rot6d_to_rotmat, rotation_angles_about
 from hoidata.metrics.encoded import UNKNOWN, recorded_motions
 from hoidata.metrics.pair import Motion
 from hoidata.metrics.paths import FRAMES, JOINTS, even_frames, joints_and_presence
@@ -71,7 +71,7 @@ def corrected_input(motion: Motion, sides: tuple[Side, ...]) -> np.ndarray:
     positions = np.where(visible[..., None], joints[frames] - upright_rotation @ origin, 0.0)
     distances_m = np.concatenate([_distances_m(motion, side, frames) for side in SIDES], axis=1)
     distances_m = np.where(visible, distances_m, FAR_M)
-    turns_rad = turns_about(rot6d_to_rotmat(objects[:, OBJECT_ROTATION_6D]), np.array((0.0, 0.0, 1.0)))
+    turns_rad = rotation_angles_about(rot6d_to_rotmat(objects[:, OBJECT_ROTATION_6D]), np.array((0.0, 0.0, 1.0)))
     heading_rad = np.concatenate(([0.0], np.cumsum(turns_rad)))[:, None]  # unwrapped: full rotations add up
     columns = (positions.reshape(len(frames), -1), objects, heading_rad, distances_m)
     return np.concatenate(columns, axis=1).astype(np.float32)

@@ -14,12 +14,12 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from hoidata.files import atomic_folder, canonical_json, sha256_bytes, write_whole
-from hoidata.files.sealed import METADATA_KEY
+from hoidata.files.checksums import METADATA_KEY
 from hoidata.hands import HandPair
 from hoidata.metrics.encoded import UNKNOWN
 from hoidata.settings import plain_config
 from hoidata.store.annotated import AnnotatedStore, load_annotated
-from hoidata.workers import in_workers
+from hoidata.workers import map_in_workers
 from models.common.checkpoints import save_checkpoint
 from models.common.repeatable import make_repeatable, restored_rng
 from models.evaluator.encoders import stored_network, weights_digest
@@ -126,7 +126,7 @@ def train_evaluators(
     if progress is not None:
         identity = [code, plain_config(settings), *(examples.digest() for examples in parts.values())]
         finished = Path(progress) / sha256_bytes(canonical_json(identity).encode())[:16]
-    trained = dict(in_workers(Training(parts, settings, jobs > 1, finished), runs, jobs))
+    trained = dict(map_in_workers(Training(parts, settings, jobs > 1, finished), runs, jobs))
     with atomic_folder(out) as partial:
         for name in settings.networks:
             trainings = [trained[name, seed] for seed in settings.seeds]

@@ -22,7 +22,7 @@ SEAM_S = 1.0  # predicted fingers are blended to the recorded poses before and a
 MAX_INTERPOLATED_S = 2.0  # in a gap up to this, interpolation has a lower error than the network (docs/fingers.md)
 
 
-class Given(NamedTuple):
+class AnimationInput(NamedTuple):
     """A checked trajectory file as input of the network."""
 
     control: Control
@@ -30,7 +30,7 @@ class Given(NamedTuple):
     notes: list[str]  # warnings for the user
 
 
-def given_control(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, TrackedHand]) -> Given:
+def control_from_file(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, TrackedHand]) -> AnimationInput:
     """Check the trajectories of a file with an object and convert them to a control signal.
 
     Raises:
@@ -47,9 +47,9 @@ def given_control(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side,
         for side, metres in accepted.nearest_m.items()
         if side not in accepted.active
     ]
-    if note := surface_index(model).solid_note:
+    if note := surface_index(model).repair_note:
         notes.append(f"{note}; fingers may pass through open parts")
-    return Given(accepted.control, accepted.active, notes)
+    return AnimationInput(accepted.control, accepted.active, notes)
 
 
 def at_30_fps(control: Control) -> Control:
@@ -74,7 +74,7 @@ def at_30_fps(control: Control) -> Control:
     return Control(wrists, resampled(control.object_motion), control.model, hinge)
 
 
-def clip_control(clip: Clip) -> Control:
+def control_from_clip(clip: Clip) -> Control:
     """Wrists and object of a recorded clip; an untracked wrist has its pose of the nearest tracked frame."""
     time_s = np.arange(clip.n_frames) / FPS
     transform = clip.object.world_from_object
@@ -115,7 +115,7 @@ def gap_of(track: HandTrack, frames: slice) -> Gap:
     return Gap(int(first), int(stop), before, after)
 
 
-def new_fingers(predictor: Predictor, hand: TrackedHand, side: Side, control: Control, gap: Gap,
+def predict_fingers(predictor: Predictor, hand: TrackedHand, side: Side, control: Control, gap: Gap,
                 seam_s: float = SEAM_S) -> np.ndarray:  # fmt: skip
     """Predict finger rotations (frame, joint - 1, 3, 3) of a gap.
 
@@ -138,7 +138,7 @@ def new_fingers(predictor: Predictor, hand: TrackedHand, side: Side, control: Co
     return blend_ends(predicted[known_frames:], gap.before, gap.after, round(seam_s / predictor.settings.step_s))
 
 
-def straight_fingers(gap: Gap) -> np.ndarray:
+def interpolate_fingers(gap: Gap) -> np.ndarray:
     """Interpolate finger rotations (frame, joint - 1, 3, 3) of a gap between the poses before and after it."""
     if gap.before is None or gap.after is None:
         raise ValueError("a gap without a known pose on both sides")

@@ -19,7 +19,7 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.surface_index import surface_index
 from hoidata.settings import build_config
 from models.common.checkpoints import Checkpoint, load_checkpoint
-from models.common.family import Family, Figures, LeftOut, Sources, motion_clip
+from models.common.family import Family, Figures, Skipped, Sources, motion_clip
 from models.manipnet.control import Control, control_of, finger_rotmats_of, hands_of, trajectories_of
 from models.manipnet.features import FeatureSettings
 from models.manipnet.network import ManipNet
@@ -151,7 +151,7 @@ class FingerSampler:
         assert isinstance(checkpoint.network, ManipNet)
         return cls(checkpoint, sources.hands, Predictor(checkpoint.network, config.rule))
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
+    def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
         features_by_clip = dict[str, tuple[torch.Tensor, torch.Tensor]]()
         for request in requests:
             if request.trajectories is not None and request.clip_id not in features_by_clip:
@@ -160,7 +160,7 @@ class FingerSampler:
         return [
             motion_clip(request, *features_by_clip[request.clip_id], synthetic)
             if request.clip_id in features_by_clip
-            else LeftOut(request.motion_id, NO_TRAJECTORIES)
+            else Skipped(request.motion_id, NO_TRAJECTORIES)
             for request in requests
         ]
 

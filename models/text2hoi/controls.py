@@ -20,10 +20,10 @@ from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.hands import HandPair
-from hoidata.refinement import carried_share, hold_clip
+from hoidata.refinement import carried_fraction, refine_grasps
 from hoidata.settings import build_config
 from models.baselines.retrieval import PROMPT_LOOKUP, VERB_LOOKUP
-from models.common.family import Family, LeftOut, Sampler, Sources
+from models.common.family import Family, Sampler, Skipped, Sources
 from models.text2hoi.family import NAMES, OtherPrompt, load_text2hoi, other_prompts
 from models.text2hoi.sampler import Candidate, SamplingConfig, Text2Hoi, best_candidates, verb_check_results
 from models.text2hoi.verb_check import VerbCheck, usual_motion
@@ -39,16 +39,16 @@ class OtherContact:
     model: Text2Hoi
     others: dict[str, Tensor]  # contact maps by clip id; a clip without another one of its object is absent
 
-    def sample(self, requests: Sequence[Request]) -> Sequence[Clip | LeftOut]:
-        return self.sample_asked(requests)[0]
+    def sample(self, requests: Sequence[Request]) -> Sequence[Clip | Skipped]:
+        return self.sample_with_targets(requests)[0]
 
-    def sample_asked(self, requests: Sequence[Request]) -> tuple[Sequence[Clip | LeftOut], list[np.ndarray]]:
+    def sample_with_targets(self, requests: Sequence[Request]) -> tuple[Sequence[Clip | Skipped], list[np.ndarray]]:
         own = self.model.contact_maps(requests)
         given = [self.others.get(request.clip_id, mine) for request, mine in zip(requests, own, strict=True)]
-        made, _ = self.model.sample_asked(requests, contact_maps=given)
+        made, _ = self.model.sample_with_targets(requests, contact_maps=given)
         reason = "no other test clip of its object has another contact map"
         answers = [
-            clip if request.clip_id in self.others else LeftOut(request.motion_id, reason)
+            clip if request.clip_id in self.others else Skipped(request.motion_id, reason)
             for request, clip in zip(requests, made, strict=True)
         ]
         return answers, [contact_map.amax(0).numpy() > 0 for contact_map in own]
@@ -60,11 +60,11 @@ class OwnContact:
 
     other_prompt: OtherPrompt
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
-        return self.sample_asked(requests)[0]
+    def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
+        return self.sample_with_targets(requests)[0]
 
-    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip | LeftOut], list[np.ndarray | None]]:
-        return self.other_prompt.sample_asked(requests, self.other_prompt.model.contact_maps(requests))
+    def sample_with_targets(self, requests: Sequence[Request]) -> tuple[list[Clip | Skipped], list[np.ndarray | None]]:
+        return self.other_prompt.sample_with_targets(requests, self.other_prompt.model.contact_maps(requests))
 
 
 def other_contact_maps(sources: Sources) -> dict[str, Tensor]:
@@ -107,7 +107,7 @@ OTHER_PROMPT_OWN_CONTACT = _family(
 
 
 @dataclass(frozen=True)
-class HeldLookup:
+class RefinedRetrieval:
     """A retrieval baseline with contact refinement and rejection sampling."""
 
     lookup: Sampler  # retrieves training clips
@@ -116,13 +116,13 @@ class HeldLookup:
     check: VerbCheck  # of the training clips
 
     @classmethod
-    def load(cls, lookup: Family, sources: Sources) -> "HeldLookup":
+    def load(cls, lookup: Family, sources: Sources) -> "RefinedRetrieval":
         config = build_config(SamplingConfig, sources.settings.get("text2hoi"), "params.yaml: sample.text2hoi")
         store = sources.annotated
         check = VerbCheck.read(usual_motion(store), store.contact_threshold_m, sources.hands)
         return cls(lookup.load(sources), sources.hands, config, check)
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
+    def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
         found = list(self.lookup.sample(requests))
         there = [row for row, one in enumerate(found) if isinstance(one, Clip)]
 
@@ -136,16 +136,16 @@ class HeldLookup:
             found[row] = drawn.clip
         return found
 
-    def _held(self, request: Request, found: Clip | LeftOut) -> Candidate:
+    def _held(self, request: Request, found: Clip | Skipped) -> Candidate:
         assert isinstance(found, Clip)
-        clip = hold_clip(self.pair, found, self.config.contact_refinement)
+        clip = refine_grasps(self.pair, found, self.config.contact_refinement)
         asked = request.sentence.verb if request.sentence else None
         known = verb_check_results(self.check, clip, request.points, asked)
-        return Candidate(clip, carried_share(self.pair, clip, self.config.contact_refinement), **known)
+        return Candidate(clip, carried_fraction(self.pair, clip, self.config.contact_refinement), **known)
 
 
 def _held(lookup: Family) -> Family:
-    return Family(f"{lookup.name}-held", f"{lookup.title}, held", partial(HeldLookup.load, lookup))
+    return Family(f"{lookup.name}-refined", f"{lookup.title}, refined", partial(RefinedRetrieval.load, lookup))
 
 
 PROMPT_LOOKUP_HELD, VERB_LOOKUP_HELD = _held(PROMPT_LOOKUP), _held(VERB_LOOKUP)

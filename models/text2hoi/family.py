@@ -17,7 +17,7 @@ from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.settings import build_config
 from models.common.checkpoints import load_checkpoint
-from models.common.family import Family, Figures, LeftOut, Sources
+from models.common.family import Family, Figures, Skipped, Sources
 from models.common.point_net import normalised_points
 from models.common.predicting import first_sentence
 from models.text2hoi.contact_training import (
@@ -145,10 +145,10 @@ class BeforeRefiner:
     model: Text2Hoi
 
     def sample(self, requests: Sequence[Request]) -> list[Clip]:
-        return self.sample_asked(requests)[0]
+        return self.sample_with_targets(requests)[0]
 
-    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
-        return self.model.sample_asked(requests, refined=False)
+    def sample_with_targets(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
+        return self.model.sample_with_targets(requests, refined=False)
 
 
 @dataclass(frozen=True)
@@ -158,20 +158,20 @@ class OtherPrompt:
     model: Text2Hoi
     other: dict[str, ClipSample]  # by clip id, the clip whose sentence to use; a clip that is absent is skipped
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
-        return self.sample_asked(requests)[0]
+    def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
+        return self.sample_with_targets(requests)[0]
 
-    def sample_asked(
+    def sample_with_targets(
         self, requests: Sequence[Request], contact_maps: Sequence[Tensor] | None = None
-    ) -> tuple[list[Clip | LeftOut], list[np.ndarray | None]]:
+    ) -> tuple[list[Clip | Skipped], list[np.ndarray | None]]:
         """contact_maps: as in ``Text2Hoi.motions``."""
-        answers: list[Clip | LeftOut] = [LeftOut(request.motion_id, NO_OTHER_SENTENCE) for request in requests]
+        answers: list[Clip | Skipped] = [Skipped(request.motion_id, NO_OTHER_SENTENCE) for request in requests]
         maps: list[np.ndarray | None] = [None] * len(requests)
         indices = [index for index, request in enumerate(requests) if request.clip_id in self.other]
         given_maps = None if contact_maps is None else [contact_maps[index] for index in indices]
         if indices:
             swapped = self.with_other_sentences([requests[index] for index in indices])
-            motions = self.model.sample_asked(swapped, contact_maps=given_maps)
+            motions = self.model.sample_with_targets(swapped, contact_maps=given_maps)
             for index, clip, contact_map in zip(indices, *motions, strict=True):
                 answers[index], maps[index] = clip, contact_map
         return answers, maps

@@ -29,7 +29,7 @@ from hoidata.hands import HandPair, load_embedded_hands
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import POINT_COUNT, SampledPoints, sample_points
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
-from hoidata.surface.contact import PlacedHand, deepest_m, placed_hand
+from hoidata.surface.contact import HandInObjectFrame, deepest_m, hand_in_object_frame
 from models.common.checkpoints import FILE_NAME, Checkpoint
 from models.common.vocabulary import Vocabulary
 from models.text2hoi.length import SHORTEST_FRAMES
@@ -73,7 +73,7 @@ class GeneratedMotion:
 
 
 @dataclass(frozen=True)
-class Wish:
+class MotionOptions:
     """A user's options; None leaves the choice to the sentence or to the length network."""
 
     seed: int = 0
@@ -126,7 +126,11 @@ class Generator:
         return cls(model, hands, encoder, Vocabulary.read(model.trained["contact"].facts), digests, points)
 
     def generate(
-        self, text: str, object: ObjectModel, wish: Wish = Wish(), object_words: str | None = None
+        self,
+        text: str,
+        object: ObjectModel,
+        wish: MotionOptions = MotionOptions(),
+        object_words: str | None = None,
     ) -> list[GeneratedMotion]:
         """Motions for an English sentence on ``object`` (metres, z up).
 
@@ -165,12 +169,12 @@ class Generator:
         pairs = zip(requests, answers, strict=True)
         return [self._generated(request, answer, points, evidence) for request, answer in pairs]
 
-    def _used(self, wish: Wish) -> dict[str, str]:
+    def _used(self, wish: MotionOptions) -> dict[str, str]:
         """SHA-256 of the networks that are used; a requested length needs no length network."""
         used = (*self.model.used, *(("length",) if wish.frames is None else ()))
         return {name: digest for name, digest in self.checkpoints.items() if name in used}
 
-    def _hand(self, text: str, wish: Wish) -> HandChoice:
+    def _hand(self, text: str, wish: MotionOptions) -> HandChoice:
         """The requested hand; otherwise the hand chosen from the sentence, or else by its frequency in training."""
         if wish.hand:
             return HandChoice(wish.hand, "rule", 1.0, "requested by the user")
@@ -179,7 +183,7 @@ class Generator:
         prior = {hand: count / total for hand, count in counts.items()}
         return choose_hand(text, self.encoder, prior, wish.hand_by)
 
-    def _request(self, first: Request, text: str, wish: Wish, number: int) -> Request:
+    def _request(self, first: Request, text: str, wish: MotionOptions, number: int) -> Request:
         """The request of sample ``number``; its seed depends on sentence, object and number."""
         motion_id = first.motion_id if number == 0 else f"{first.motion_id}~{number}"
         seed_text = f"{wish.seed} {number} {first.object.name} {text}"
@@ -258,7 +262,7 @@ def visible_faults(
     """
     index = surface_index(clip.object.model)
     active: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
-    placed: dict[Side, PlacedHand] = {side: placed_hand(clip, side, hands) for side in active}
+    placed: dict[Side, HandInObjectFrame] = {side: hand_in_object_frame(clip, side, hands) for side in active}
     gaps: dict[Side, np.ndarray] = {side: _gap_m(hand, index) for side, hand in placed.items()}
     faults = [*_contact_faults(clip, gaps), *_depth_faults(placed, index)]
     if check is not None:
@@ -273,9 +277,9 @@ def visible_faults(
     return tuple(faults)
 
 
-def _gap_m(hand: PlacedHand, index: SurfaceIndex) -> np.ndarray:
+def _gap_m(hand: HandInObjectFrame, index: SurfaceIndex) -> np.ndarray:
     """(frame,) metres from the skin to the surface, infinite without the hand."""
-    return hand.over_clip(index.distance_m(hand.vertices_m, hand.hinge_rad).min(axis=1), np.inf)
+    return hand.expand_to_clip(index.distance_m(hand.vertices_m, hand.hinge_rad).min(axis=1), np.inf)
 
 
 def _contact_faults(clip: Clip, gap_m: Mapping[Side, np.ndarray]) -> list[str]:
@@ -289,7 +293,7 @@ def _contact_faults(clip: Clip, gap_m: Mapping[Side, np.ndarray]) -> list[str]:
     return faults
 
 
-def _depth_faults(placed: Mapping[Side, PlacedHand], index: SurfaceIndex) -> list[str]:
+def _depth_faults(placed: Mapping[Side, HandInObjectFrame], index: SurfaceIndex) -> list[str]:
     if not index.is_solid:
         return []
     faults = []

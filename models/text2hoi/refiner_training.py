@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, collate
-from hoidata.batches.sight import Sight
+from hoidata.batches.frame_selection import FrameSelection
 from hoidata.devices import send
 from models.common import losses
 from models.common.corpus import Corpus, any_form
@@ -126,8 +126,8 @@ class RefinerObjective:
         assert self.held_out is not None
         return self._losses(network, self.held_out)["total"]
 
-    def _selection(self, samples: list[ClipSample]) -> Sight:
-        return Sight.drawn([sample.length for sample in samples], self.frames, 0, np.random.default_rng(0))
+    def _selection(self, samples: list[ClipSample]) -> FrameSelection:
+        return FrameSelection.drawn([sample.length for sample in samples], self.frames, 0, np.random.default_rng(0))
 
     def _losses(self, network: RefinerModel, comparison: _Comparison) -> dict[str, Tensor]:
         batch, coarse, weights = comparison.batch, comparison.coarse, self.weights

@@ -19,8 +19,8 @@ from torch import Tensor
 from hoidata.batches.requests import ObjectPoints, Request, RequestBatch, collate_requests
 from hoidata.clips.clip import Clip
 from hoidata.hands import HandPair
-from hoidata.refinement import HoldSettings, carried_share, hold_clip
-from hoidata.settings import at_least
+from hoidata.refinement import GraspSettings, carried_fraction, refine_grasps
+from hoidata.settings import require_at_least
 from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.family import motion_clip
 from models.common.features import Hands
@@ -121,7 +121,7 @@ class SamplingConfig:
     # What corrects the hands: the refiner network, or contact refinement by optimisation, which also keeps a resting
     # object at rest. "preset": contact refinement if the diffusion network gives hands in the object's frame (`ours`).
     refined_by: Literal["preset", "network", "contact_refinement"] = "preset"
-    contact_refinement: HoldSettings = field(default_factory=HoldSettings)
+    contact_refinement: GraspSettings = field(default_factory=GraspSettings)
     # Candidates per motion, at most: another one is sampled if the hands cannot carry the object, if the object
     # moves as for another verb, or if object or hands move outside the range of the verb's training clips.
     max_attempts: int = 5
@@ -133,7 +133,7 @@ class SamplingConfig:
 
     def __post_init__(self) -> None:
         for name in ("max_attempts", "contact_map_samples"):
-            at_least("sample.text2hoi", self, name, 1)
+            require_at_least("sample.text2hoi", self, name, 1)
 
 
 @dataclass(frozen=True)
@@ -200,9 +200,9 @@ class Text2Hoi:
 
     def sample(self, requests: Sequence[Request]) -> list[Clip]:
         """Refined motions."""
-        return self.sample_asked(requests)[0]
+        return self.sample_with_targets(requests)[0]
 
-    def sample_asked(
+    def sample_with_targets(
         self, requests: Sequence[Request], refined: bool = True, contact_maps: Sequence[Tensor] | None = None
     ) -> tuple[list[Clip], list[np.ndarray]]:
         """Motions, and the contact map (N,) bool that was the condition of each; arguments as in ``motions``."""
@@ -241,7 +241,7 @@ class Text2Hoi:
         for request, motion, clip in zip(requests, motions, clips, strict=True):
             verb = requested_verb(self.trained["diffusion"], request)
             results = {} if check is None else verb_check_results(check, clip, request.points, verb)
-            carried = carried_share(self.pair, clip, self.config.contact_refinement)
+            carried = carried_fraction(self.pair, clip, self.config.contact_refinement)
             answers.append(Answer(clip=clip, motion=motion, carried=carried, **results))
         return answers
 
@@ -253,7 +253,7 @@ class Text2Hoi:
         ]
         if not self._held(refined):
             return clips
-        return [hold_clip(self.pair, clip, self.config.contact_refinement) for clip in clips]
+        return [refine_grasps(self.pair, clip, self.config.contact_refinement) for clip in clips]
 
     def _held(self, refined: bool) -> bool:
         """Whether contact refinement corrects the hands."""

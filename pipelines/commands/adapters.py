@@ -71,7 +71,7 @@ def sentences(
     """Print the four sentences that the stage annotate writes for each verb and object of GRAB, H2O and ARCTIC."""
     from importlib import import_module
 
-    from hoidata.annotation.sentences import four_sentences
+    from hoidata.annotation.sentences import english_sentences
 
     for name in names or TEMPLATED:
         if name not in TEMPLATED:
@@ -79,7 +79,7 @@ def sentences(
         pairs = import_module(f"hoidata.datasets.{name}.{TEMPLATED[name]}").PAIRS
         typer.echo(f"{name}: {len(pairs)} pairs of verb and object")
         for verb, noun in pairs:
-            typer.echo(f"  {verb}, {noun}: {' '.join(four_sentences(verb, noun, hand))}")
+            typer.echo(f"  {verb}, {noun}: {' '.join(english_sentences(verb, noun, hand))}")
 
 
 @app.command()

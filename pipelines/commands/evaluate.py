@@ -51,7 +51,7 @@ def evaluate(
     """Compare the predicted clips of a store with the recorded clips they stand for, and print a table of metrics."""
     from hoidata.files import write_whole
     from hoidata.metrics.evaluate import evaluate_store
-    from hoidata.metrics.optional_metrics import with_lists
+    from hoidata.metrics.optional_metrics import select_metrics
     from pipelines.pages.metrics_table import printed_table, unmeasured_lines
     from pipelines.stages.base import jobs
 
@@ -60,7 +60,7 @@ def evaluate(
         from models.evaluator.encoders import load_evaluators
 
         encoders = load_evaluators(evaluators)
-    hands, chosen_metrics = _hands(reference), with_lists(filter(None, metrics.split(",")))
+    hands, chosen_metrics = _hands(reference), select_metrics(filter(None, metrics.split(",")))
     results = evaluate_store(
         store, reference, hands, split=split, metrics=chosen_metrics, encoders=encoders, jobs=jobs(), progress=True
     )

@@ -16,8 +16,8 @@ def repro(
 ) -> None:
     """Run all stages whose inputs have changed, in parallel; first check that the raw files exist."""
     enter_project()
+    from pipelines.parallel_repro import describe_run
     from pipelines.repro import reproduce
-    from pipelines.side_by_side import describe_run
 
     run = reproduce(targets or [], jobs, force=force)
     print(describe_run(run))

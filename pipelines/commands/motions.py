@@ -108,7 +108,7 @@ def generate(
     root = enter_project() if models is None else None
     from hoidata.clips.clip import FPS
     from hoidata.errors import BadInput
-    from models.text2hoi.generation import Wish
+    from models.text2hoi.generation import MotionOptions
     from pipelines.command_inputs import MeshOptions
     from pipelines.generation import GenerationRequest, generate_files
     from pipelines.params import read_params
@@ -124,7 +124,7 @@ def generate(
         text,
         mesh or object,
         model=model,
-        wish=Wish(seed=seed, samples=samples, hand=hand, frames=frames, hand_by=hand_by),
+        wish=MotionOptions(seed=seed, samples=samples, hand=hand, frames=frames, hand_by=hand_by),
         mesh=MeshOptions(unit, up, hinge),
         sampler={name: value for name, value in overrides.items() if value is not None},
         force=force,

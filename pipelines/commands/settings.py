@@ -23,10 +23,10 @@ SECTIONS = {
 def settings(section: Annotated[str, typer.Argument(help="One section of params.yaml. Default: all.")] = "") -> None:
     """Print the current settings of the data stages, including defaults, in the format of params.yaml."""
     enter_project()
-    from hoidata.settings import plain_config, refuse_unknown
+    from hoidata.settings import check_keys, plain_config
     from pipelines.stages.base import load_settings
 
-    refuse_unknown({section: None} if section else {}, list(SECTIONS), "hoidata settings")
+    check_keys({section: None} if section else {}, list(SECTIONS), "hoidata settings")
     names = [section] if section else list(SECTIONS)
     values = {name: plain_config(load_settings(settings_class(name), name)) for name in names}
     typer.echo(yaml.safe_dump(values, sort_keys=False, width=120), nl=False)

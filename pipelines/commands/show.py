@@ -34,9 +34,9 @@ def show(
         path = _write_page_of(data, clip_or_dataset, out or Path.cwd())
     elif clip_or_dataset:
         project = enter_project()
-        from pipelines.showing import write_shown
+        from pipelines.show_pages import write_named_page
 
-        path = write_shown(clip_or_dataset, profile or current_profile(), out or project / ".hoidata" / "pages")
+        path = write_named_page(clip_or_dataset, profile or current_profile(), out or project / ".hoidata" / "pages")
     else:
         raise BadInput("hoidata show", "a clip's id, a dataset's name, or --data FOLDER", "none", "name one")
     typer.echo(path)
@@ -47,9 +47,9 @@ def show(
 def _write_page_of(data: Path, clip_id: str, out: Path) -> Path:
     """Write the page of a clip in a folder; in a project, hoidata.toml names the user's MANO files."""
     from hoidata.store.store import read_info
-    from pipelines.showing import write_shown_of
+    from pipelines.show_pages import write_page_from
 
     with suppress(MissingResource):
         enter_project()
     store = data if (data / "meta").is_dir() else data / "clips"
-    return write_shown_of(data, clip_id, hands_of(read_info(store)["hand_model"]["digest"], str(data)), out)
+    return write_page_from(data, clip_id, hands_of(read_info(store)["hand_model"]["digest"], str(data)), out)

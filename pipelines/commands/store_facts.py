@@ -5,7 +5,7 @@ from typing import Any
 import pandas as pd
 
 from hoidata.clips.clip import FPS, SIDES
-from hoidata.store.info import stand_in_note
+from hoidata.store.info import embedded_hand_warning
 from hoidata.store.store import Store
 
 Rows = list[tuple[str, ...]]
@@ -39,7 +39,7 @@ def fact_rows(store: Store) -> Rows:
 
 
 def _hand_model(info: dict[str, Any]) -> str:
-    note = stand_in_note(info)
+    note = embedded_hand_warning(info)
     return f"{info['hand_model']['name']} {info['hand_model']['digest'][:12]}" + (f"; warning: {note}" if note else "")
 
 

@@ -18,7 +18,7 @@ import yaml
 from hoidata.dataset_folders import dataset_facts
 from hoidata.files import sha256_file
 from hoidata.store.fields import STORE_FILES, StoreFile
-from hoidata.store.info import stand_in_note
+from hoidata.store.info import embedded_hand_warning
 from hoidata.store.store import Store
 from pipelines.exports.licences import OWN_USE, ArrayLicence, licences_of
 from pipelines.exports.motion import Column
@@ -165,7 +165,7 @@ def _conventions(info: dict[str, Any], description: Description) -> list[str]:
         "The wrist joint is joint 0; it is not MANO's transl.",
         f"- Frames in which a hand is not tracked are marked; {description.untracked}.",
     ]
-    if stand_in := stand_in_note(info):
+    if stand_in := embedded_hand_warning(info):
         lines.append(f"- Warning: {markdown_text(stand_in)}.")
     if description.columns:
         lines += ["", "| array | type | shape | meaning |", "|---|---|---|---|"]

@@ -13,7 +13,7 @@ from typing import Any
 
 from hoidata.errors import BadInput
 from hoidata.files.atomic import write_whole
-from hoidata.files.sealed import payload_digest, seal_fault
+from hoidata.files.checksums import corrupted_part, payload_digest
 from hoidata.files.written import read_json
 from hoidata.processor import processor_name
 from pipelines.lineage.locks import Locked, dvc_digest, other_files, read_locks
@@ -54,7 +54,7 @@ def _shortened(names: list[str]) -> str:
 
 def _check_checksum(file: Path, name: str) -> Node:
     try:
-        fault = seal_fault(file)
+        fault = corrupted_part(file)
     except BadInput:
         fault = "header"
     return (

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hoidata.errors import BadInput
-from hoidata.files.sealed import read_metadata
+from hoidata.files.checksums import read_metadata
 from hoidata.files.written import read_json
 from pipelines.lineage.digests import path_digest, value_digest
 from pipelines.lineage.graph import Stage, look_up, producers, written_graph

@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from hoidata.errors import BadInput, HoidataError
-from hoidata.files.sealed import payload_digest
+from hoidata.files.checksums import payload_digest
 from hoidata.lifetime import end_with_parent
 from hoidata.machine_folder import SETTINGS
 from pipelines.lineage.locks import read_locks

@@ -13,8 +13,8 @@ from typing import Any, Literal
 
 from hoidata.errors import BadInput
 from hoidata.files.atomic import sha256_file
+from hoidata.files.checksums import corrupted_part, payload_digest
 from hoidata.files.numpy_files import load_npz_objects
-from hoidata.files.sealed import payload_digest, seal_fault
 from hoidata.files.written import read_json
 from pipelines.lineage.history import History
 from pipelines.lineage.locks import Locked, cached_listing, dvc_digest, lock_files, parse_locks, read_locks
@@ -92,7 +92,7 @@ def motion_checkpoints(path: Path) -> dict[str, str]:
 
 def _checkpoint(root: Path | None, path: Path, name: str) -> Target:
     try:
-        record, fault = read_provenance(path), seal_fault(path)
+        record, fault = read_provenance(path), corrupted_part(path)
     except BadInput:
         # A file that a stage wrote as a checkpoint, and that is now damaged.
         if root is None or (stage := _producer(read_locks(root), name)) is None:

@@ -18,7 +18,7 @@ from hoidata.objects.surface_index import surface_index
 from hoidata.quality.thresholds import CLIP_MEASURES
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.hand_evidence import HandEvidence
-from hoidata.store.info import stand_in_note
+from hoidata.store.info import embedded_hand_warning
 from hoidata.surface.measure import SideSurface, measure_hand
 from pipelines.pages.quality import read_limits
 
@@ -193,7 +193,7 @@ def clip_facts(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> Rows:
         ("source frames", source_frames_text(clip)),
         ("gravity", _gravity(clip)),
         ("hands from", _hands_from(clip)),
-        ("hand model", "; ".join(filter(None, (hands.name, stand_in_note(annotated.info))))),
+        ("hand model", "; ".join(filter(None, (hands.name, embedded_hand_warning(annotated.info))))),
         ("camera", _camera(clip)),
         ("further data", _further(clip)),
         ("licence", licence),

@@ -12,7 +12,7 @@ from hoidata.files.atomic import canonical_json
 from hoidata.hands import HandPair
 from hoidata.metrics.unmeasured import NO_INSIDE
 from hoidata.object_paths.path import PathStep
-from models.bimart.hands import TOUCH_M, MadeHands, Standing
+from models.bimart.hands import TOUCH_M, ContactMeasures, SampledHands
 from pipelines.pages.glb import HAND_COLOURS
 from pipelines.pages.motion_files import ARRAYS as SHARED
 from pipelines.pages.motion_files import (
@@ -53,7 +53,7 @@ class Strip:
 
 def write_hands(
     out_dir: str | Path,
-    motions: Sequence[MadeHands],
+    motions: Sequence[SampledHands],
     hands: HandPair,
     steps: Sequence[PathStep],
     made_from: Mapping[str, str],
@@ -88,7 +88,7 @@ def write_hands(
     )
 
 
-def hands_arrays(motion: MadeHands, hands: HandPair, made_from: Mapping[str, str]) -> dict[str, np.ndarray]:
+def hands_arrays(motion: SampledHands, hands: HandPair, made_from: Mapping[str, str]) -> dict[str, np.ndarray]:
     """The arrays of motion.npz (``ARRAYS``)."""
     touching = motion.standing.touching
     nothing = np.zeros(motion.clip.n_frames, bool)
@@ -106,7 +106,7 @@ def hands_arrays(motion: MadeHands, hands: HandPair, made_from: Mapping[str, str
     }
 
 
-def _shown(motion: MadeHands, hands: HandPair, steps: Sequence[PathStep]) -> dict[str, Any]:
+def _shown(motion: SampledHands, hands: HandPair, steps: Sequence[PathStep]) -> dict[str, Any]:
     """The content of the page for one motion."""
     caption = f"sample {motion.number + 1}"
     title = f"{caption}: hands for {motion.clip.object_words}"
@@ -117,11 +117,11 @@ def _shown(motion: MadeHands, hands: HandPair, steps: Sequence[PathStep]) -> dic
         "before": motion_player(simplified_for_page(motion.before), hands, f"{title}, before refinement", caption),
         "strips": _strips(motion, steps),
         "maps": [_map(motion, side, title) for side in motion.standing.touching],
-        "measures": _measures(motion.standing_before, motion.standing),
+        "measures": _measures(motion.unrefined_measures, motion.standing),
     }
 
 
-def _map(motion: MadeHands, side: Side, title: str) -> tuple[Player, Player, str]:
+def _map(motion: SampledHands, side: Side, title: str) -> tuple[Player, Player, str]:
     """Players of the target and the generated contact map of one hand, and their agreement in words."""
     side_index = SIDES.index(side)
     target_m, reached_m = motion.asked_m[side_index], motion.reached_m[side_index].min(axis=0)
@@ -140,13 +140,13 @@ def _map(motion: MadeHands, side: Side, title: str) -> tuple[Player, Player, str
     return first, second, f"{side} hand: {words}; distances differ by {error_cm:.1f} cm on average"
 
 
-def _paint(motion: MadeHands, distance_m: np.ndarray) -> ContactPaint:
+def _paint(motion: SampledHands, distance_m: np.ndarray) -> ContactPaint:
     """1 where a hand touches, fading to 0 at a distance of 2 cm; distance_m: (point,)."""
     value = np.clip((FADES_M - distance_m) / (FADES_M - TOUCH_M), 0, 1)
     return ContactPaint(motion.points.points_m, motion.points.part, value)
 
 
-def _strips(motion: MadeHands, steps: Sequence[PathStep]) -> list[Strip]:
+def _strips(motion: SampledHands, steps: Sequence[PathStep]) -> list[Strip]:
     frames = motion.clip.n_frames
     end_s = (frames - 1) / FPS
     strips = [
@@ -168,7 +168,7 @@ def _runs(mask: np.ndarray) -> list[tuple[float, float, str]]:
     ]
 
 
-def _measures(before: Standing, after: Standing) -> list[tuple[str, ...]]:
+def _measures(before: ContactMeasures, after: ContactMeasures) -> list[tuple[str, ...]]:
     """(name, before, after) of contact, depth and acceleration."""
     measures: list[tuple[str, ...]] = [
         (

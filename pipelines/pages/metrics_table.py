@@ -23,7 +23,13 @@ ALL_METRICS: tuple[AnyMetric, ...] = (
     *FEATURE_METRICS,
     *(metric for metrics in OPTIONAL_LISTS.values() for metric in metrics),
 )
-RETRIEVAL_BASELINES = ("nearest-clip", "verb-lookup", "verb-lookup-held", "prompt-lookup", "prompt-lookup-held")
+RETRIEVAL_BASELINES = (
+    "nearest-clip",
+    "verb-retrieval",
+    "verb-retrieval-refined",
+    "prompt-retrieval",
+    "prompt-retrieval-refined",
+)
 CONTROLS = "controls"
 NOT_COMPUTED = "-"
 NOT_MEASURED = "not measured"

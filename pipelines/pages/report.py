@@ -11,7 +11,7 @@ from hoidata.dataset_folders import dataset_title
 from hoidata.files import atomic_file
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore
-from hoidata.store.info import stand_in_note
+from hoidata.store.info import embedded_hand_warning
 from pipelines.pages.curves import Panel, log_curves, panels_svg, read_log
 from pipelines.pages.dataset_facts import DatasetFacts, read_dataset, reason_for_nothing
 from pipelines.pages.dataset_page import can_be_shown, write_dataset_page
@@ -99,7 +99,7 @@ def write_report(
 def _stand_ins(sections: Sequence[Section]) -> list[str]:
     """The replacements of licensed models or encoders that the profile uses, in words."""
     infos = [section.facts.info for section in sections if section.facts.info]
-    notes = [note for info in infos if (note := stand_in_note(info))]
+    notes = [note for info in infos if (note := embedded_hand_warning(info))]
     annotation_infos = [section.facts.annotated.annotation_info for section in sections if section.facts.annotated]
     names = {str(info["encoder"]["name"]) for info in annotation_infos}
     notes += [f"sentences are encoded by {ENCODERS[name]}" for name in sorted(names & ENCODERS.keys())]

@@ -69,7 +69,7 @@ def _end_with_dvc() -> None:
 
 
 def _run(module, options: argparse.Namespace) -> int:
-    from hoidata.errors import BadInput, HoidataError, told_in_words
+    from hoidata.errors import BadInput, HoidataError, explain_machine_errors
     from hoidata.workers import choose_workers
     from pipelines.params import read_params
     from pipelines.sidecar import noted_run
@@ -82,7 +82,7 @@ def _run(module, options: argparse.Namespace) -> int:
         if paths.profile not in ("", chosen):
             raise BadInput("--profile", f"{chosen}, which params.yaml chooses", paths.profile, "set it in params.yaml")
         choose_workers(os.environ.get("HOIDATA_WORKERS") or str(params.get("workers", "local")))
-        with told_in_words(), noted_run(f"{options.stage}@{paths}"):
+        with explain_machine_errors(), noted_run(f"{options.stage}@{paths}"):
             module.run(replace(paths, profile=chosen))
     except HoidataError as error:
         print(f"{options.stage} of {paths}: {error}", file=sys.stderr)

@@ -11,7 +11,7 @@ def run(paths: StagePaths) -> None:
     from hoidata.annotation.settings import AnnotationSettings
     from hoidata.annotation.stage import annotate_store
     from hoidata.contact.settings import read_contact_settings
-    from hoidata.quality.thresholds import left_out_reasons
+    from hoidata.quality.thresholds import exclusion_reasons
 
     counts = annotate_store(
         paths.clips,
@@ -19,6 +19,6 @@ def run(paths: StagePaths) -> None:
         load_settings(AnnotationSettings, "annotate"),
         contact=read_contact_settings(paths.contact),
         hands=load_hands(paths.profile),
-        excluded=left_out_reasons(paths.quality),
+        excluded=exclusion_reasons(paths.quality),
     )
     print_counts(paths, counts)

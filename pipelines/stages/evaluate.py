@@ -75,14 +75,14 @@ def _measured(paths: StagePaths, settings: EvaluateSettings) -> dict[str, Any]:
     if reason := next(filter(None, map(empty_reason, (*_inputs(paths), paths.samples))), None):
         return {"empty": reason, "held_out_clips": 0}
     from hoidata.metrics.evaluate import evaluate_store
-    from hoidata.metrics.optional_metrics import with_lists
+    from hoidata.metrics.optional_metrics import select_metrics
 
     print(f"{paths}: measuring", flush=True)
     metrics = evaluate_store(
         paths.samples / "clips",
         paths.data,
         load_hands(paths.profile),
-        metrics=with_lists(settings.metrics),
+        metrics=select_metrics(settings.metrics),
         encoders=_encoders(paths.evaluators),
         jobs=jobs(),
         progress=True,

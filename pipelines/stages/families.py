@@ -3,7 +3,7 @@
 from typing import Any
 
 from hoidata.errors import BadInput
-from hoidata.settings import refuse_unknown
+from hoidata.settings import check_keys
 
 # By folder of models/: families with stages only for the datasets of ``family_datasets`` in params.yaml.
 OPTIONAL_FAMILIES = {
@@ -19,7 +19,7 @@ def families_of(params: dict[str, Any], dataset: str) -> list[str]:
     Raises BadInput for names that have no stages.
     """
     chosen = params.get(KEY) or {}
-    refuse_unknown(chosen, list(OPTIONAL_FAMILIES), f"params.yaml: {KEY}")
+    check_keys(chosen, list(OPTIONAL_FAMILIES), f"params.yaml: {KEY}")
     for folder, optional in OPTIONAL_FAMILIES.items():
         datasets = chosen.get(folder) or []
         if unknown := [name for name in datasets if name not in params["datasets"]]:

@@ -12,7 +12,7 @@ from hoidata.files import sha256_file
 from models.registry import load_network
 from pipelines.lineage.graph import producers, written_graph
 from pipelines.lineage.provenance import build_provenance
-from pipelines.params import laid_over, read_file, read_params
+from pipelines.params import merge_settings, read_file, read_params
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, write_empty
 
 
@@ -32,7 +32,7 @@ class TrainParams:
     def of(self, network: str) -> dict[str, Any]:
         """The settings of a network in the chosen preset and size, and the seed; the others keep their defaults."""
         method, size = (getattr(self, name).get(network) or {} for name in (self.preset, self.size))
-        return laid_over(laid_over(method, size), {"seed": self.seed})
+        return merge_settings(merge_settings(method, size), {"seed": self.seed})
 
 
 def run(paths: StagePaths) -> None:

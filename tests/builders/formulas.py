@@ -88,12 +88,12 @@ def hand_axes(joints: np.ndarray) -> np.ndarray:
     return np.array(axes) / np.linalg.norm(axes, axis=1, keepdims=True)
 
 
-def has_its_own_side(joints: dict[str, np.ndarray]) -> bool:
+def has_correct_handedness(joints: dict[str, np.ndarray]) -> bool:
     """Whether both hands have the correct handedness: a left hand's axes are right-handed."""
     return all(np.linalg.det(hand_axes(joints[side])) * sign > 0.9 for side, sign in (("left", 1), ("right", -1)))
 
 
-def sits_as_described(joints: dict[str, np.ndarray], edges: np.ndarray, edges_seen: np.ndarray) -> bool:
+def is_seated_correctly(joints: dict[str, np.ndarray], edges: np.ndarray, edges_seen: np.ndarray) -> bool:
     """Whether the right hand is on the person's right, and hand axes and object edges are as expected."""
     pairs = [(hand_axes(joints[side]), FINGERS_THUMB_PALM[side]) for side in joints] + [(edges, edges_seen)]
     cosines = [np.sum(actual * expected, axis=1) / np.linalg.norm(actual, axis=1) for actual, expected in pairs]

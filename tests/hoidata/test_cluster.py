@@ -14,7 +14,7 @@ from hoidata.datasets.grab.adapter import GrabAdapter
 from hoidata.errors import BadInput
 from hoidata.files.atomic import sha256_file
 from hoidata.hands import load_embedded_hands
-from hoidata.workers import in_order, in_workers
+from hoidata.workers import in_order, map_in_workers
 from tests.hoidata.conversion.killable import write_grab
 
 distributed = pytest.importorskip("distributed")
@@ -122,9 +122,9 @@ def doubled(number: int) -> int:
 
 def test_an_exception_of_the_function_is_raised_and_in_order_sorts_results(on_cluster):
     numbers = list(range(40))
-    assert list(in_order(in_workers(doubled, numbers, 1), numbers)) == [(number, 2 * number) for number in numbers]
+    assert list(in_order(map_in_workers(doubled, numbers, 1), numbers)) == [(number, 2 * number) for number in numbers]
     with pytest.raises(BadInput, match="0 or more"):
-        list(in_workers(doubled, [1, -1, 2], 1))
+        list(map_in_workers(doubled, [1, -1, 2], 1))
 
 
 def test_a_cluster_without_a_worker_is_refused(monkeypatch):
@@ -133,7 +133,7 @@ def test_a_cluster_without_a_worker_is_refused(monkeypatch):
         workers.choose_workers(empty.scheduler_address)
         try:
             with pytest.raises(BadInput, match="none for 1 s"):
-                list(in_workers(doubled, [1, 2], 1))
+                list(map_in_workers(doubled, [1, 2], 1))
         finally:
             workers.choose_workers("local")
 
@@ -142,8 +142,8 @@ def test_a_cluster_without_a_worker_is_refused(monkeypatch):
 def test_a_cluster_started_for_a_call_ends_with_it(monkeypatch):
     workers.choose_workers("dask")
     try:
-        assert not workers.is_used_for(1)
-        assert sorted(in_workers(doubled, [1, 2, 3], 2)) == [(1, 2), (2, 4), (3, 6)]
+        assert not workers.uses_cluster(1)
+        assert sorted(map_in_workers(doubled, [1, 2, 3], 2)) == [(1, 2), (2, 4), (3, 6)]
     finally:
         workers.choose_workers("local")
 
@@ -155,6 +155,6 @@ def test_an_unreachable_or_invalid_address_is_refused(monkeypatch):
     workers.choose_workers("tcp://127.0.0.1:9")
     try:
         with pytest.raises(BadInput, match="a Dask scheduler at"):
-            list(in_workers(doubled, [1, 2], 1))
+            list(map_in_workers(doubled, [1, 2], 1))
     finally:
         workers.choose_workers("local")

@@ -169,11 +169,11 @@ class Slow:
 
 CTRL_C_DURING_START = """
 import multiprocessing, os, signal, sys
-from hoidata.lifetime import begin_worker, ctrl_c_blocked
+from hoidata.lifetime import init_worker, block_ctrl_c
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, lambda *_: None)
-    process = multiprocessing.get_context("spawn").Process(target=begin_worker)
-    with ctrl_c_blocked():
+    process = multiprocessing.get_context("spawn").Process(target=init_worker)
+    with block_ctrl_c():
         process.start()
     for _ in range(200):
         os.kill(process.pid, signal.SIGINT)

@@ -8,7 +8,7 @@ import pytest
 
 from hoidata import settings
 from hoidata.errors import BadInput
-from hoidata.settings import at_least, build_config, plain_config
+from hoidata.settings import build_config, plain_config, require_at_least
 
 
 @dataclass(frozen=True)
@@ -87,9 +87,9 @@ def test_a_number_instead_of_a_list_is_refused():
 
 
 def test_a_value_below_the_minimum_is_refused():
-    at_least("here", Example(), "count", 3)
+    require_at_least("here", Example(), "count", 3)
     with pytest.raises(BadInput, match=r"here\.count: expected 4 or more, got 3"):
-        at_least("here", Example(), "count", 4)
+        require_at_least("here", Example(), "count", 4)
 
 
 def test_a_renamed_key_is_refused_with_its_new_name(monkeypatch: pytest.MonkeyPatch):

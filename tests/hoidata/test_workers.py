@@ -16,7 +16,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from hoidata.errors import BadInput
-from hoidata.workers import WorkerLost, in_workers
+from hoidata.workers import WorkerDied, map_in_workers
 
 
 def squared(item: int) -> int:
@@ -54,18 +54,18 @@ def blas_threads(_: int) -> int:
 
 @pytest.mark.slow
 def test_an_item_that_kills_each_process_is_lost_and_all_others_are_done():
-    results = dict(in_workers(deadly, range(6), 2, on_lost=lambda error: f"{error.item}: {error.cause}"))
+    results = dict(map_in_workers(deadly, range(6), 2, on_worker_died=lambda error: f"{error.item}: {error.cause}"))
     assert results == {0: 0, 1: 1, 2: 4, 3: "3: signal SIGSEGV", 4: 16, 5: 25}
     done = []
-    with pytest.raises(WorkerLost, match=r"3: expected.*SIGSEGV"):
-        done.extend(item for item, _ in in_workers(deadly, range(6), 2))
+    with pytest.raises(WorkerDied, match=r"3: expected.*SIGSEGV"):
+        done.extend(item for item, _ in map_in_workers(deadly, range(6), 2))
     assert not multiprocessing.active_children()
 
 
 @pytest.mark.slow
 def test_an_item_whose_process_dies_once_is_repeated(tmp_path):
     paths = [tmp_path / str(number) for number in range(3)]
-    assert dict(in_workers(deadly_once, paths, 2)) == {path: path.name for path in paths}
+    assert dict(map_in_workers(deadly_once, paths, 2)) == {path: path.name for path in paths}
 
 
 @pytest.mark.slow
@@ -87,7 +87,12 @@ def test_a_process_that_dies_before_it_reads_its_function_is_replaced():
     killer.start()
     signal.alarm(60)
     try:
-        assert dict(in_workers(partial(squared_with_ballast, bytes(1 << 20)), range(4), 2)) == {0: 0, 1: 1, 2: 4, 3: 9}
+        assert dict(map_in_workers(partial(squared_with_ballast, bytes(1 << 20)), range(4), 2)) == {
+            0: 0,
+            1: 1,
+            2: 4,
+            3: 9,
+        }
     finally:
         signal.alarm(0)
         over.set()
@@ -98,18 +103,18 @@ def test_a_process_that_dies_before_it_reads_its_function_is_replaced():
 @pytest.mark.slow
 def test_an_exception_of_the_function_names_the_item_and_ends_the_workers():
     with pytest.raises(RuntimeError, match=r"3: Traceback(?s:.)*ZeroDivisionError"):
-        list(in_workers(broken, range(6), 2))
+        list(map_in_workers(broken, range(6), 2))
     assert not multiprocessing.active_children()
 
 
 WORKERS = """
 import os, time
-from hoidata.workers import in_workers
+from hoidata.workers import map_in_workers
 def work(item):
     print(os.getpid(), flush=True)
     time.sleep(60)
 if __name__ == "__main__":
-    list(in_workers(work, range(2), 2))
+    list(map_in_workers(work, range(2), 2))
 """
 POOL = """
 import os, time
@@ -150,18 +155,18 @@ def test_worker_processes_end_with_their_parent(tmp_path, code, count, sent):
 
 
 def test_one_job_works_in_this_process():
-    assert list(in_workers(squared, range(3), 1)) == [(0, 0), (1, 1), (2, 4)]
+    assert list(map_in_workers(squared, range(3), 1)) == [(0, 0), (1, 1), (2, 4)]
 
 
 def test_one_job_uses_one_blas_thread_and_restores_the_number():
     with threadpool_limits(2, user_api="blas"):
-        assert list(in_workers(blas_threads, [0], 1)) == [(0, 1)]
+        assert list(map_in_workers(blas_threads, [0], 1)) == [(0, 1)]
         assert blas_threads(0) == 2
 
 
 def test_a_lost_worker_can_be_pickled():
     import pickle
 
-    error = pickle.loads(pickle.dumps(WorkerLost("grab/s1/1", "signal SIGSEGV")))
+    error = pickle.loads(pickle.dumps(WorkerDied("grab/s1/1", "signal SIGSEGV")))
     assert isinstance(error, BadInput)
     assert (error.where, error.cause) == ("grab/s1/1", "signal SIGSEGV")

@@ -20,8 +20,8 @@ from torch._subclasses.fake_tensor import FakeTensorMode, unset_fake_temporarily
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
 from hoidata.batches.dataset import collate
+from hoidata.batches.frame_selection import FrameSelection
 from hoidata.batches.requests import Request
-from hoidata.batches.sight import Sight
 from hoidata.hands import load_embedded_hands
 from hoidata.settings import build_config
 from hoidata.store.annotated import load_annotated
@@ -34,7 +34,7 @@ from models.common.predicting import PredictionConfig, requests_for
 from models.common.sampling import SamplerConfig
 from models.text2hoi.motion_representation import MotionRepresentation, MotionRepresentationConfig
 from models.text2hoi.sampler import NETWORKS, SamplingConfig, Text2Hoi
-from pipelines.params import laid_over, read_params
+from pipelines.params import merge_settings, read_params
 from tests.models.toy import PARAMS, POINT_NET, TRANSFORMER
 
 BACKEND = "nodata"
@@ -127,7 +127,7 @@ def trained(network: Network, preset: str, corpus: Corpus, stored: dict[str, Che
     if preset == "ours":  # all its settings, at the toy's sizes
         ours = read_params(ROOT)["train"]["ours"][network.name]
         network_settings, loss_settings = (
-            laid_over(ours.get("network", {}), PARAMS[network.name]["network"]),
+            merge_settings(ours.get("network", {}), PARAMS[network.name]["network"]),
             ours.get("loss", {}),
         )
     config = build_config(network.config, network_settings, network.name)
@@ -153,7 +153,9 @@ def trained(network: Network, preset: str, corpus: Corpus, stored: dict[str, Che
     )
     objective, _ = network.objective(setup)
     clips = list(corpus.train)
-    sight = Sight.drawn([c.length for c in clips], objective.frames, objective.entries, np.random.default_rng(0))
+    sight = FrameSelection.drawn(
+        [c.length for c in clips], objective.frames, objective.entries, np.random.default_rng(0)
+    )
     optimiser = torch.optim.AdamW([weight for weight in objective.network.parameters() if weight.requires_grad])
     with step():
         batch = collate(clips, sight if objective.frames else None).to(DEVICE)

@@ -13,23 +13,30 @@ from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.hands import load_embedded_hands, track_joints
-from hoidata.metrics.target_contact import read_asked
-from hoidata.refinement import HoldSettings, hold_clip
+from hoidata.metrics.target_contact import read_target_contact
+from hoidata.refinement import GraspSettings, refine_grasps
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
 from models.baselines.controls import HANDS_AWAY_M
 from models.baselines.retrieval import NEAREST_CLIP, Prompt, Retrieval, by_sentence, of_the_hand
-from models.common.family import LeftOut, Sources
+from models.common.family import Skipped, Sources
 from models.common.predicting import PredictionConfig, requests_for, sample_family
 from models.registry import load_family
-from models.text2hoi.controls import HeldLookup, OtherContact, OwnContact, other_contact_maps
+from models.text2hoi.controls import OtherContact, OwnContact, RefinedRetrieval, other_contact_maps
 from models.text2hoi.sampler import Text2Hoi
 from models.text2hoi.verb_check import VerbCheck
 
 HANDS = load_embedded_hands()
 PERTURBED = ("static", "reversed", "object-moved", "hands-away", "pressed", "noise")
 LOOKUPS = (
-    *("prompt-lookup", "prompt-lookup-held", "verb-lookup", "verb-lookup-held", "random-clip", "other-verb"),
+    *(
+        "prompt-retrieval",
+        "prompt-retrieval-refined",
+        "verb-retrieval",
+        "verb-retrieval-refined",
+        "random-clip",
+        "other-verb",
+    ),
     *("swapped-hands", "other-hands", "nearest-clip"),
 )
 MODELS = ("one-call", "other-contact", "other-prompt-own-contact")
@@ -51,7 +58,7 @@ def requests_of(sample: ClipSample, count: int = 2) -> list[Request]:
     return requests_for(sample, PredictionConfig(samples=count))
 
 
-def answers(sources: Sources, family: str, sample: ClipSample, count: int = 2) -> Sequence[Clip | LeftOut]:
+def answers(sources: Sources, family: str, sample: ClipSample, count: int = 2) -> Sequence[Clip | Skipped]:
     return load_family(family).load(sources).sample(requests_of(sample, count))
 
 
@@ -78,7 +85,7 @@ def test_every_answer_is_the_requested_motion_or_a_reason(sources, test, family)
     for sample in test:
         for request, answer in zip(requests_of(sample), answers(sources, family, sample), strict=True):
             assert answer.clip_id == request.motion_id
-            if isinstance(answer, LeftOut):
+            if isinstance(answer, Skipped):
                 assert family in ("other-verb",)
             else:
                 assert (answer.n_frames, answer.object.model.name) == (sample.length, sample.object_model.name)
@@ -96,8 +103,10 @@ def test_a_hand_that_was_not_requested_is_unchanged(sources, annotated, test, fa
 
 def test_refined_retrieval_is_retrieval_with_contact_refinement(sources, test):
     for sample in test:
-        retrieved, refined = (motions(sources, name, sample)[0] for name in ("prompt-lookup", "prompt-lookup-held"))
-        side, expected = acting(sample), hold_clip(HANDS, retrieved, HoldSettings())
+        retrieved, refined = (
+            motions(sources, name, sample)[0] for name in ("prompt-retrieval", "prompt-retrieval-refined")
+        )
+        side, expected = acting(sample), refine_grasps(HANDS, retrieved, GraspSettings())
         np.testing.assert_array_equal(refined.object.translation_m, expected.object.translation_m)
         np.testing.assert_array_equal(joints(refined, side), track_joints(expected.hands[side], HANDS[side]))
         assert np.abs(joints(refined, side) - joints(retrieved, side)).max() > 1e-4
@@ -106,15 +115,15 @@ def test_refined_retrieval_is_retrieval_with_contact_refinement(sources, test):
 def test_refined_retrieval_is_resampled_by_the_rules_of_text2hoi(sources, test, monkeypatch):
     """The next clip of the ranking, or the least unusual clip if none is usual."""
     sample, several = test[0], requests_for(test[0], PredictionConfig(samples=2))
-    family = HeldLookup.load(NEAREST_CLIP, replace(sources, settings={"text2hoi": {"max_attempts": 3}}))
+    family = RefinedRetrieval.load(NEAREST_CLIP, replace(sources, settings={"text2hoi": {"max_attempts": 3}}))
     plain = NEAREST_CLIP.load(sources)
     ranked = [plain.sample([replace(several[0], number=number)])[0] for number in range(6)]
-    places = [hold_clip(HANDS, ranked_clip, HoldSettings()).object.translation_m for ranked_clip in ranked]
+    places = [refine_grasps(HANDS, ranked_clip, GraspSettings()).object.translation_m for ranked_clip in ranked]
     for beyond, taken in (([0, 0], [0, 1]), ([3, 0, 2, 1], [2, 1]), ([0, 3, 0], [0, 2]), ([1, 2, 1, 2, 1, 2], [0, 1])):
         left = [float(ranked_clip) for ranked_clip in beyond]
         monkeypatch.setattr(VerbCheck, "fails", lambda self, verb, moved_as: False)
         monkeypatch.setattr(VerbCheck, "beyond", lambda self, verb, numbers, left=left: left.pop(0))
-        monkeypatch.setattr("models.text2hoi.controls.carried_share", lambda *requested_verbs: 1.0)
+        monkeypatch.setattr("models.text2hoi.controls.carried_fraction", lambda *requested_verbs: 1.0)
         refined = family.sample(several)
         assert left == []
         for one, number in zip(refined, taken, strict=True):
@@ -124,15 +133,15 @@ def test_refined_retrieval_is_resampled_by_the_rules_of_text2hoi(sources, test, 
     monkeypatch.setattr(VerbCheck, "beyond", lambda self, verb, numbers: 0.0)
     monkeypatch.setattr(VerbCheck, "fails", lambda self, verb, moved_as: False)
     shares = [1.0, 0.0, 1.0]
-    monkeypatch.setattr("models.text2hoi.controls.carried_share", lambda *requested_verbs: shares.pop(0))
+    monkeypatch.setattr("models.text2hoi.controls.carried_fraction", lambda *requested_verbs: shares.pop(0))
     nowhere = replace(several[0], motion_id="nowhere")
     lookup = SimpleNamespace(
         sample=lambda verb: [
-            LeftOut("nowhere", "no clip") if one.motion_id == "nowhere" else plain.sample([one])[0] for one in verb
+            Skipped("nowhere", "no clip") if one.motion_id == "nowhere" else plain.sample([one])[0] for one in verb
         ]
     )
     refined = replace(family, lookup=lookup).sample([several[0], nowhere, several[1]])
-    assert isinstance(refined[1], LeftOut)
+    assert isinstance(refined[1], Skipped)
     for one, number in ((refined[0], 0), (refined[2], 2)):
         np.testing.assert_array_equal(one.object.translation_m, places[number])
     monkeypatch.undo()
@@ -304,7 +313,7 @@ def test_recorded_and_perturbed_clips_have_the_recorded_target_contact(
 ):
     for family in ("ground-truth", "hands-away"):
         sample_family(load_family(family), annotated_root, trained, tmp_path / family, {"samples": 1}, HANDS)
-        targets = read_asked(tmp_path / family / "clips")
+        targets = read_target_contact(tmp_path / family / "clips")
         assert list(targets) == open_store(tmp_path / family / "clips", HANDS).ids
         for sample in test:
             np.testing.assert_array_equal(targets[f"{sample.clip_id}~0"], sample.contact_map)
@@ -342,18 +351,18 @@ def test_other_contact_is_the_map_with_least_overlap_on_the_same_object(sources,
     np.testing.assert_array_equal(other_maps[second.clip_id] > 0, first.contact_map)
     family = load_family("other-contact").load(sources)
     assert isinstance(family, OtherContact)
-    _, targets = family.sample_asked(requests_of(first))
+    _, targets = family.sample_with_targets(requests_of(first))
     sampled_maps = family.model.contact_maps(requests_of(first))
     np.testing.assert_array_equal(targets, np.stack([contact_map.amax(0).numpy() > 0 for contact_map in sampled_maps]))
     alone = OtherContact(family.model, {})
-    assert {type(answer) for answer in alone.sample(requests_of(first))} == {LeftOut}
+    assert {type(answer) for answer in alone.sample(requests_of(first))} == {Skipped}
 
 
 def test_own_contact_combines_the_contact_of_the_prompt_with_another_prompts_motion(sources, test):
     family, other = (load_family(name).load(sources) for name in ("other-prompt-own-contact", "other-prompt"))
     assert isinstance(family, OwnContact)
     requests = requests_of(test[0])
-    (first, _), maps = family.sample_asked(requests)
+    (first, _), maps = family.sample_with_targets(requests)
     sampled_maps = family.other_prompt.model.contact_maps(requests)
     np.testing.assert_array_equal(maps, np.stack([contact_map.amax(0).numpy() > 0 for contact_map in sampled_maps]))
     (with_other_prompt, _) = other.sample(requests)

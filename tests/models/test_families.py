@@ -16,8 +16,8 @@ from hoidata.clips.clip import SIDES, Clip
 from hoidata.contact.maps import f1_score
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
-from hoidata.metrics.target_contact import read_asked
-from hoidata.refinement import HoldSettings, hold_hands
+from hoidata.metrics.target_contact import read_target_contact
+from hoidata.refinement import GraspSettings, refined_tracks
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
 from models.baselines.retrieval import Retrieval
@@ -138,7 +138,7 @@ def test_the_nearest_clip_to_a_training_sentence_is_that_clip_and_the_next_is_an
     assert abs(first.object.translation_m - second.object.translation_m).max() > 0.01
 
 
-@pytest.mark.parametrize("name", ["nearest-clip", "prompt-lookup", "random-clip"])
+@pytest.mark.parametrize("name", ["nearest-clip", "prompt-retrieval", "random-clip"])
 def test_retrieval_skips_clips_with_an_untracked_acting_hand(name, sources: Sources, monkeypatch):
     whole = samples_of(sources.annotated, "train")
     right, both = (next(one for one in whole if one.hand_type == kind) for kind in ("right", "both"))
@@ -236,7 +236,7 @@ def test_contact_refinement_replaces_the_refiner_by_setting_or_in_the_object_fra
     (motion,) = model.motions([request])
     assert torch.equal(motion.refined, motion.coarse)
     (before,), (refined,) = (model.clips([request], [motion], refined=kind) for kind in (False, True))
-    for side, track in hold_hands(HANDS, before).items():
+    for side, track in refined_tracks(HANDS, before).items():
         np.testing.assert_array_equal(refined.hands[side].hand_pose, track.hand_pose)
     in_object = MotionRepresentation(MotionRepresentationConfig(4, hand_frame="object"))
     monkeypatch.setattr(usual.trained["diffusion"].network, "representation", in_object)
@@ -283,11 +283,11 @@ def test_motions_that_cannot_carry_or_show_another_verb_are_resampled(
     assert isinstance(model, Text2Hoi)
     sampled, left, verbs = list[Clip](), list(shares), list(others)
 
-    def carried_share(pair: HandPair, clip: Clip, settings: HoldSettings) -> float:
+    def carried_fraction(pair: HandPair, clip: Clip, settings: GraspSettings) -> float:
         sampled.append(clip)
         return left.pop(0)
 
-    monkeypatch.setattr("models.text2hoi.sampler.carried_share", carried_share)
+    monkeypatch.setattr("models.text2hoi.sampler.carried_fraction", carried_fraction)
     monkeypatch.setattr(VerbCheck, "moved_as", lambda self, numbers: verbs.pop(0))
     beyond = iter([{"u": 0.5, "b": 1.0, "v": 2.0}.get(nearest_verb, 0.0) for nearest_verb in others])
     monkeypatch.setattr(VerbCheck, "beyond", lambda self, verb, numbers: next(beyond))
@@ -303,7 +303,7 @@ def test_only_contact_refinement_checks_carrying_and_verb(sources: Sources, monk
     request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
     model = load_family("text2hoi").load(sources)
     assert isinstance(model, Text2Hoi)
-    monkeypatch.setattr("models.text2hoi.sampler.carried_share", None)
+    monkeypatch.setattr("models.text2hoi.sampler.carried_fraction", None)
     monkeypatch.setattr("models.text2hoi.sampler.VerbCheck", None)
     assert [answer.attempts for answer in model.answers([request])] == [1]
 
@@ -318,7 +318,7 @@ def test_sampling_writes_a_store_and_the_diagnostics_of_the_family(
     store = open_store(tmp_path / "a" / "clips", HANDS)
     assert store.ids == ["toy/s3/5~0", "toy/s3/5~1", "toy/s3/6~0", "toy/s3/6~1"]
     assert store.clip("toy/s3/6~1").n_frames == 33
-    targets = read_asked(tmp_path / "a" / "clips")
+    targets = read_target_contact(tmp_path / "a" / "clips")
     assert list(targets) == store.ids
     assert all(contact_map.shape == (1024,) and contact_map.any() for contact_map in targets.values())
     figures = json.loads((tmp_path / "a" / "diagnostics.json").read_text())
@@ -343,9 +343,9 @@ def test_families_report_the_sampled_contact_map(
     for family in ("text2hoi", "text2hoi-coarse"):
         sampler = load_family(family).load(sources)
         assert isinstance(sampler, ReportsContact)
-        np.testing.assert_array_equal(sampler.sample_asked(requests)[1], sampled_maps)
+        np.testing.assert_array_equal(sampler.sample_with_targets(requests)[1], sampled_maps)
     sample_family(load_family("nearest-clip"), annotated_root, trained, tmp_path / "a", {"samples": 1}, HANDS)
-    assert read_asked(tmp_path / "a" / "clips") == {}
+    assert read_target_contact(tmp_path / "a" / "clips") == {}
 
 
 def test_a_family_that_cannot_answer_gives_the_reason(annotated_root: Path, trained: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, HoiDataset, collate
-from hoidata.batches.sight import Sight
+from hoidata.batches.frame_selection import FrameSelection
 from hoidata.hands import load_embedded_hands
 from hoidata.store.annotated import AnnotatedStore
 from models.common import losses
@@ -117,7 +117,7 @@ def test_the_length_network_reads_text_and_64_numbers_of_noise() -> None:
 @pytest.fixture(scope="module")
 def batch(annotated: AnnotatedStore) -> ClipBatch:
     clips = list(HoiDataset(annotated, "train"))
-    return collate(clips, Sight.drawn([clip.length for clip in clips], 5, 2000, np.random.default_rng(0)))
+    return collate(clips, FrameSelection.drawn([clip.length for clip in clips], 5, 2000, np.random.default_rng(0)))
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import torch
 import trimesh
 
 from hoidata.batches.dataset import ClipBatch, collate
-from hoidata.batches.sight import Sight
+from hoidata.batches.frame_selection import FrameSelection
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.signed_distance_grid import DistanceFields
@@ -31,7 +31,7 @@ def test_joints_of_the_features_are_the_stored_joints(batch: ClipBatch, hands: H
 
 
 def test_distance_entries_of_chosen_frames_equal_the_distances(batch: ClipBatch) -> None:
-    sight = Sight.drawn(batch.lengths.tolist(), 5, 10_000, np.random.default_rng(0))
+    sight = FrameSelection.drawn(batch.lengths.tolist(), 5, 10_000, np.random.default_rng(0))
     chosen_batch = collate(batch.samples, sight)
     joints, objects = (
         losses.take_frames(tensor, chosen_batch.chosen, axis)

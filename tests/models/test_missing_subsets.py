@@ -12,10 +12,10 @@ from safetensors.torch import load_file
 from hoidata.batches.dataset import HoiDataset
 from hoidata.hands import load_embedded_hands
 from hoidata.store.annotated import AnnotatedStore, load_annotated
-from models.bimart.family import NO_OTHER, HandsForPaths
+from models.bimart.family import NO_OTHER, BimArtSampler
 from models.common.checkpoints import load_checkpoint
 from models.common.corpus import Corpus
-from models.common.family import LeftOut, Sources
+from models.common.family import Skipped, Sources
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.training import train_network
 from models.evaluator.settings import EvaluatorSettings
@@ -128,9 +128,9 @@ def test_a_mean_without_training_clips_of_the_hand_has_a_reason(
     sample = HoiDataset(store, "test", crop="start")[0]
     sampler = load_family(family).load(Sources(store, tmp_path, HANDS, torch.device("cpu")))
     answers = sampler.sample(requests_for(sample, PredictionConfig(samples=1)))
-    assert [type(answer) for answer in answers] == [LeftOut]
+    assert [type(answer) for answer in answers] == [Skipped]
     right = replace(requests_for(sample, PredictionConfig(samples=1))[0], active_hands=np.array([False, True]))
-    assert [type(answer) for answer in sampler.sample([right])] != [LeftOut]
+    assert [type(answer) for answer in sampler.sample([right])] != [Skipped]
 
 
 def test_without_training_clips_there_is_no_nearest_window(tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ def test_without_training_clips_there_is_no_nearest_window(tmp_path: Path) -> No
     store = load_annotated(write_annotated(tmp_path, [make_clip(0, TOY_MOTIONS[0])], rule=rule))
     sampler = load_family("nearest-window").load(Sources(store, tmp_path, HANDS, torch.device("cpu")))
     requests = requests_for(HoiDataset(store, "test", crop="start")[0], PredictionConfig(samples=1))
-    assert [type(answer) for answer in sampler.sample(requests)] == [LeftOut]
+    assert [type(answer) for answer in sampler.sample(requests)] == [Skipped]
 
 
 def test_a_clip_whose_sentence_all_test_clips_have_gets_no_other_prompt(tmp_path: Path, trained: Path) -> None:
@@ -151,7 +151,7 @@ def test_a_clip_whose_sentence_all_test_clips_have_gets_no_other_prompt(tmp_path
     requests = requests_for(sample, PredictionConfig(samples=1))
     for family in ("other-prompt", "other-prompt-own-contact"):
         answers = load_family(family).load(sources).sample(requests)
-        assert answers == [LeftOut(requests[0].motion_id, "all test clips have its sentence")]
+        assert answers == [Skipped(requests[0].motion_id, "all test clips have its sentence")]
 
 
 def test_bimart_gets_another_object_only_if_there_is_one(tmp_path: Path) -> None:
@@ -169,7 +169,7 @@ def test_bimart_gets_another_object_only_if_there_is_one(tmp_path: Path) -> None
     }
     box, notebook = requests[TOY_MOTIONS[0].model.name], requests[TOY_MOTIONS[2].model.name]
     left_out = {
-        change: [HandsForPaths(None, HANDS, None, True, change, store)._why_not(one) for one in (box, notebook)]  # type: ignore[arg-type]
+        change: [BimArtSampler(None, HANDS, None, True, change, store)._why_not(one) for one in (box, notebook)]  # type: ignore[arg-type]
         for change in ("other object", "other path", "none")
     }
     assert left_out == {

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, HoiDataset, collate
-from hoidata.batches.sight import Sight
+from hoidata.batches.frame_selection import FrameSelection
 from hoidata.clips.features import OBJECT_POSITION
 from hoidata.hands import load_embedded_hands
 from hoidata.store.annotated import AnnotatedStore
@@ -114,7 +114,7 @@ def test_an_augmented_copy_of_a_rotation_in_place_rotates_in_place(batch: ClipBa
 def test_recorded_motions_have_no_loss_of_joints_and_distances(annotated: AnnotatedStore) -> None:
     """Recorded motions have zero loss, with shifted mesh origins and one control point per frame."""
     clips = [moved_origin(clip) for clip in HoiDataset(annotated, "train")]
-    batch = collate(clips, Sight.drawn([clip.length for clip in clips], 5, 2000, np.random.default_rng(0)))
+    batch = collate(clips, FrameSelection.drawn([clip.length for clip in clips], 5, 2000, np.random.default_rng(0)))
     motion = replace(BOX_CENTRE, knot_frames=0, object_knots=1, object_rotation="absolute")
     network = DiffusionModel(DiffusionConfig(TransformerConfig(32, 1), motion=motion))
     loss = DiffusionLossConfig(joint_weight=1.0)

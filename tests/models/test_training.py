@@ -30,11 +30,10 @@ from models.common.sampling import SamplerConfig
 from models.common.training import TrainingConfig, fit, learning_rate_factor, train_network
 from models.registry import load_network
 from models.text2hoi.diffusion import DiffusionModel
-from models.text2hoi.generation import GeneratedMotion, Generator, Wish
+from models.text2hoi.generation import GeneratedMotion, Generator, MotionOptions
 from models.text2hoi.sampler import SamplingConfig, Text2Hoi
 from models.text2hoi.verb_check import VerbCheck
-from pipelines.generation import GenerationRequest as Asked
-from pipelines.generation import Models, generate_files
+from pipelines.generation import GenerationRequest, Models, generate_files
 from tests.models.toy import PARAMS, train
 
 
@@ -131,7 +130,7 @@ def user_box() -> ObjectModel:
 
 
 def motion(trained: Path, text: str, seed: int) -> GeneratedMotion:
-    return generator(trained).generate(text, user_box(), Wish(seed))[0]
+    return generator(trained).generate(text, user_box(), MotionOptions(seed))[0]
 
 
 def generator(trained: Path) -> Generator:
@@ -160,23 +159,23 @@ def test_generation_is_reproducible_and_uses_only_the_requested_hands(trained: P
 @pytest.mark.slow
 def test_a_sample_does_not_depend_on_their_number_and_lengths_are_sampled(trained: Path) -> None:
     model, text = generator(trained), "Lift a box with the right hand."
-    many = model.generate(text, user_box(), Wish(samples=6))
+    many = model.generate(text, user_box(), MotionOptions(samples=6))
     assert bytes_of(many[0]) == bytes_of(model.generate(text, user_box())[0])
     assert len({bytes_of(generated) for generated in many}) == 6
     assert len({generated.clip.n_frames for generated in many}) > 1
-    assert {generated.clip.n_frames for generated in model.generate(text, user_box(), Wish(samples=2, frames=20))} == {
-        20
-    }
+    assert {
+        generated.clip.n_frames for generated in model.generate(text, user_box(), MotionOptions(samples=2, frames=20))
+    } == {20}
 
 
 def test_options_take_precedence_over_the_sentence(trained: Path) -> None:
-    generated = generator(trained).generate("Lift a box with the right hand.", user_box(), Wish(hand="left", frames=9))[
-        0
-    ]
+    generated = generator(trained).generate(
+        "Lift a box with the right hand.", user_box(), MotionOptions(hand="left", frames=9)
+    )[0]
     assert generated.clip.hands["left"].valid.all()
     assert not generated.clip.hands["right"].valid.any()
     with pytest.raises(BadInput, match="8 to 150 frames"):
-        generator(trained).generate("Lift a box.", user_box(), Wish(frames=151))
+        generator(trained).generate("Lift a box.", user_box(), MotionOptions(frames=151))
 
 
 def test_generation_uses_the_models_settings_except_for_given_options(
@@ -187,11 +186,13 @@ def test_generation_uses_the_models_settings_except_for_given_options(
     monkeypatch.setattr(Generator, "load", lambda *arguments, **more: options.update(more) or load(*arguments, **more))
     sampling = SamplingConfig(SamplerConfig("dpm++", 3), max_attempts=1)
     models = Models(trained, load_embedded_hands(), load_encoder("hash"), sampling=sampling, points=256)
-    request = Asked("Lift a box.", tmp_path / "box.stl", models=models, wish=Wish(frames=8), sampler={"steps": 2})
+    request = GenerationRequest(
+        "Lift a box.", tmp_path / "box.stl", models=models, wish=MotionOptions(frames=8), sampler={"steps": 2}
+    )
     generate_files(request, tmp_path / "out")
     assert options == {"sampling": replace(sampling, sampler=SamplerConfig("dpm++", 2)), "points": 256}
     generated = load(trained, models.hands, models.encoder, **options).generate(
-        "Lift a box.", user_box(), Wish(frames=8)
+        "Lift a box.", user_box(), MotionOptions(frames=8)
     )[0]
     assert generated.contact.shape == (256,)
 
@@ -201,7 +202,9 @@ def test_a_mesh_file_whose_name_is_no_text_is_read_and_its_name_stays_legible(tr
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
     (tmp_path / "box.stl").rename(mesh)
     models = Models(trained, load_embedded_hands(), load_encoder("hash"))
-    generate_files(Asked("Lift a box.", mesh, models=models, wish=Wish(frames=8)), tmp_path / "out")
+    generate_files(
+        GenerationRequest("Lift a box.", mesh, models=models, wish=MotionOptions(frames=8)), tmp_path / "out"
+    )
     assert (tmp_path / "out/index.html").is_file()
     assert read_user_object(mesh).model.name == "b\\udcffx"
 
@@ -220,7 +223,7 @@ def test_a_motion_lists_exactly_the_networks_that_generated_it(
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
     sampling = SamplingConfig(refined_by=refined_by, max_attempts=1)
     models = Models(trained, load_embedded_hands(), load_encoder("hash"), sampling=sampling)
-    request = Asked("Lift a box.", tmp_path / "box.stl", models=models, wish=Wish(frames=frames))
+    request = GenerationRequest("Lift a box.", tmp_path / "box.stl", models=models, wish=MotionOptions(frames=frames))
     generate_files(request, tmp_path / "out")
     named = json.loads(str(np.load(tmp_path / "out" / "motion.npz")["checkpoints"]))
     files = {name: trained / name / "model.safetensors" for name in PARAMS}
@@ -231,7 +234,9 @@ def test_a_motion_lists_exactly_the_networks_that_generated_it(
 
 
 def test_unseen_words_are_reported(trained: Path) -> None:
-    generated = generator(trained).generate("Juggle three oranges with both hands.", user_box(), Wish(frames=8))[0]
+    generated = generator(trained).generate(
+        "Juggle three oranges with both hands.", user_box(), MotionOptions(frames=8)
+    )[0]
     assert "the verb 'juggle' was never in training" in generated.evidence["unseen"][0]
     verb, probability = generated.evidence["read_as"]
     assert verb in ("lift", "open", "pass")
@@ -241,16 +246,16 @@ def test_unseen_words_are_reported(trained: Path) -> None:
 def test_training_verbs_are_classified_correctly(trained: Path) -> None:
     sentences = {"lift": "Lift a box with the left hand.", "pass": "Pass a box with the right hand."}
     for verb, text in sentences.items():
-        generated = generator(trained).generate(text, user_box(), Wish(frames=8))[0]
+        generated = generator(trained).generate(text, user_box(), MotionOptions(frames=8))[0]
         assert generated.evidence["read_as"][0] == verb
 
 
 def test_a_sentence_classified_as_another_verb_is_reported(trained: Path, tmp_path: Path) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
-    models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), Wish(frames=8)
+    models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), MotionOptions(frames=8)
     notes = {}
     for text in ("Lift a box with the left hand.", "Juggle a box with both hands."):
-        request = Asked(text, tmp_path / "box.stl", models=models, wish=wish, force=True)
+        request = GenerationRequest(text, tmp_path / "box.stl", models=models, wish=wish, force=True)
         notes[text] = [note for note in generate_files(request, tmp_path / "out").notes if "classified as '" in note]
     assert [len(own_notes) for own_notes in notes.values()] == [0, 1]
     page = (tmp_path / "out" / "index.html").read_text()
@@ -260,18 +265,20 @@ def test_a_sentence_classified_as_another_verb_is_reported(trained: Path, tmp_pa
 
 def test_a_second_action_of_a_sentence_is_reported_as_missing(trained: Path, tmp_path: Path) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
-    models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), Wish(frames=8)
-    request = Asked("Lift a box and pass it with the left hand.", tmp_path / "box.stl", models=models, wish=wish)
+    models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), MotionOptions(frames=8)
+    request = GenerationRequest(
+        "Lift a box and pass it with the left hand.", tmp_path / "box.stl", models=models, wish=wish
+    )
     note = "a motion shows one action: this one shows 'lift', not 'pass'; generate each alone"
     assert note in generate_files(request, tmp_path / "out").notes
 
 
 def test_an_unknown_word_is_refused_unless_forced(trained: Path, tmp_path: Path) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
-    models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), Wish(frames=8)
+    models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), MotionOptions(frames=8)
 
     def notes(text: str, force: bool = False) -> list[str]:
-        request = Asked(text, tmp_path / "box.stl", models=models, wish=wish, force=force)
+        request = GenerationRequest(text, tmp_path / "box.stl", models=models, wish=wish, force=force)
         return generate_files(request, tmp_path / "out").notes
 
     for text in ("Throw the ball with the left hand.", "Juggle a box with both hands."):
@@ -288,9 +295,9 @@ def test_an_unknown_word_is_refused_unless_forced(trained: Path, tmp_path: Path)
 
 def test_a_hand_that_the_sentence_does_not_name_is_reported(trained: Path, tmp_path: Path) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
-    models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), Wish(frames=8)
+    models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), MotionOptions(frames=8)
     requests = {
-        text: Asked(text, tmp_path / "box.stl", models=models, wish=wish)
+        text: GenerationRequest(text, tmp_path / "box.stl", models=models, wish=wish)
         for text in ("Lift it.", "Lift it with the left hand.")
     }
     notes = {
@@ -310,7 +317,9 @@ def test_an_open_mesh_and_a_repaired_one_are_reported(trained: Path, tmp_path: P
     notes = {}
     for name, mesh in meshes.items():
         mesh.export(tmp_path / f"{name}.obj")
-        request = Asked("Lift a box with the left hand.", tmp_path / f"{name}.obj", models=models, wish=Wish(frames=8))
+        request = GenerationRequest(
+            "Lift a box with the left hand.", tmp_path / f"{name}.obj", models=models, wish=MotionOptions(frames=8)
+        )
         notes[name] = [note for note in generate_files(request, tmp_path / "out").notes if note.startswith("mesh: ")]
     assert notes == {
         "open": [
@@ -326,7 +335,9 @@ def test_visible_differences_are_reported_and_the_page_has_the_others(
 ) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
     models = Models(trained, load_embedded_hands(), load_encoder("hash"))
-    request = Asked("Lift a box with the left hand.", tmp_path / "box.stl", models=models, wish=Wish(frames=8))
+    request = GenerationRequest(
+        "Lift a box with the left hand.", tmp_path / "box.stl", models=models, wish=MotionOptions(frames=8)
+    )
     monkeypatch.setattr(Text2Hoi, "refined_by", "contact_refinement")
     monkeypatch.setattr("models.text2hoi.generation._contact_faults", lambda *_: [])
     monkeypatch.setattr("models.text2hoi.generation._is_still", lambda *_: False)
@@ -382,7 +393,7 @@ def test_generation_refuses_other_hands_and_encoders(trained: Path) -> None:
 
 
 def test_hands_and_encoder_default_to_those_of_the_networks(trained: Path) -> None:
-    wish, tracks = Wish(frames=8), []
+    wish, tracks = MotionOptions(frames=8), []
     for loaded in (Generator.load(trained), generator(trained)):
         tracks.append(loaded.generate("Lift a box with the left hand.", user_box(), wish)[0].clip.hands["left"])
     np.testing.assert_array_equal(tracks[0].wrist_m, tracks[1].wrist_m)

@@ -7,7 +7,7 @@ import pytest
 
 from hoidata.annotation.encoders import load_encoder
 from hoidata.annotation.hand_choice import HAND_TYPES
-from hoidata.annotation.sentences import four_sentences, reference_sentences
+from hoidata.annotation.sentences import english_sentences, reference_sentences
 from hoidata.errors import BadInput
 from models.common.vocabulary import Vocabulary
 from models.text2hoi.wording import Wording, edit_distance, understood_words
@@ -78,8 +78,8 @@ def test_ambiguous_words_are_refused_with_suggestions(text: str, expected: str) 
 @pytest.mark.parametrize("form", range(4), ids=["imperative", "passive", "subject", "gerund"])
 @pytest.mark.parametrize(("synonym", "verb"), SYNONYMS)
 def test_a_synonym_becomes_the_training_verb_in_the_same_form(synonym: str, verb: str, form: int) -> None:
-    wording = understood(four_sentences(synonym, "mug", "left")[form])
-    assert wording == Wording(four_sentences(verb, "mug", "left")[form], verb, "mug", wording.notes)
+    wording = understood(english_sentences(synonym, "mug", "left")[form])
+    assert wording == Wording(english_sentences(verb, "mug", "left")[form], verb, "mug", wording.notes)
     assert wording.notes == (f"{synonym!r} is read as {verb!r}",)
 
 
@@ -110,7 +110,7 @@ def test_sentences_of_the_corpora_are_unchanged() -> None:
     for verb in VERBS:
         for noun in (*OBJECTS, "plate", "capsule machine", "SD card"):
             for hand in HAND_TYPES:
-                for text in (*four_sentences(verb, noun, hand), *reference_sentences(verb, noun, hand)):
+                for text in (*english_sentences(verb, noun, hand), *reference_sentences(verb, noun, hand)):
                     assert understood(text).verb == verb, text
                     assert understood(text).text == text
 

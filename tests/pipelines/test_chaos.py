@@ -21,11 +21,11 @@ import psutil
 import pytest
 from typer.testing import CliRunner
 
-from hoidata.errors import BadInput, MachineTrouble, told_in_words
+from hoidata.errors import BadInput, MachineError, explain_machine_errors
 from hoidata.files.written import verify_with
 from pipelines.cli import app
 from pipelines.lineage.locks import dvc_digest, written_digest
-from pipelines.side_by_side import log_of
+from pipelines.parallel_repro import log_of
 from pipelines.stages.code import write_code
 from tests.builders.folders import kept
 from tests.pipelines.prefect_up import hoidata_up, wait_until
@@ -401,8 +401,8 @@ print(done.clips, len(done.quarantined), done.quarantined[0].remedy)
     ],
 )
 def test_machine_errors_have_a_remedy_and_other_errors_are_raised(error, words):
-    with pytest.raises(MachineTrouble, match=words), told_in_words():
+    with pytest.raises(MachineError, match=words), explain_machine_errors():
         raise error
     for defect in (FileNotFoundError(2, "No such file", "a"), ValueError("disk")):
-        with pytest.raises(type(defect)), told_in_words():
+        with pytest.raises(type(defect)), explain_machine_errors():
             raise defect

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from hoidata.files.sealed import read_metadata
+from hoidata.files.checksums import read_metadata
 
 pytestmark = [
     pytest.mark.slow,

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from hoidata.hands import load_embedded_hands
 from hoidata.metrics.evaluate import evaluate_store
 from hoidata.metrics.feature_metrics import FEATURE_METRICS
-from hoidata.metrics.optional_metrics import with_lists
+from hoidata.metrics.optional_metrics import select_metrics
 from hoidata.store.store import open_store
 from models.common.predicting import sample_family
 from models.evaluator.encoders import load_evaluators
@@ -139,7 +139,7 @@ def test_motions_taken_for_their_reverse_are_counted_among_verbs_that_have_one()
 
 
 def test_orderings_name_registered_families_and_metrics():
-    metrics = {metric.name for metric in (*with_lists(["bimart"]), *FEATURE_METRICS)}
+    metrics = {metric.name for metric in (*select_metrics(["bimart"]), *FEATURE_METRICS)}
     metrics |= {f"{CONFUSED} {name}" for name in ("paper", "corrected")}
     assert {ordering.metric for ordering in EXPECTED_ORDERINGS} <= metrics
     assert {name for ordering in EXPECTED_ORDERINGS for name in (ordering.control, ordering.reference)} <= set(
@@ -180,7 +180,7 @@ def test_every_ordering_without_a_model_holds_on_a_small_part_of_the_study_corpu
     metric_names, methods = {ordering.metric for ordering in orderings}, {}
     for name in sorted({name for ordering in orderings for name in (ordering.control, ordering.reference)}):
         sample_family(load_family(name), data, tmp_path, tmp_path / name, {"samples": 1}, hands)
-        metrics = tuple(metric for metric in with_lists(["bimart"]) if metric.name in metric_names)
+        metrics = tuple(metric for metric in select_metrics(["bimart"]) if metric.name in metric_names)
         methods[name] = evaluate_store(tmp_path / name / "clips", data, hands, metrics=metrics, encoders=encoders)
     assert methods[RECORDED]["figures"]["accuracy_top1_corrected"] >= 0.85
     results = check_orderings(

@@ -15,7 +15,7 @@ from hoidata.hands import load_embedded_hands
 from hoidata.object_paths import keyframed_path, parse_keyframes
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
-from models.bimart.hands import Standing
+from models.bimart.hands import ContactMeasures
 from pipelines.command_inputs import MeshOptions, ProjectData, stored_object
 from pipelines.hands import HandsOptions, ObjectMotion, chosen_networks, hinge_range, object_motion
 from pipelines.pages.hands_page import _measures
@@ -194,7 +194,7 @@ def test_an_open_mesh_is_moved_like_any_other(tmp_path, keys):
 
 def test_penetration_of_an_object_without_an_inside_is_reported_as_not_measured():
     touching = {"right": np.array([True, False])}
-    open_mesh, solid = (Standing(touching, depth, 1.0) for depth in (None, np.array([0.004, 0.012])))
+    open_mesh, solid = (ContactMeasures(touching, depth, 1.0) for depth in (None, np.array([0.004, 0.012])))
     rows = {name: values for name, *values in _measures(open_mesh, open_mesh)}
     reason = "not measured: the object has no inside"
     assert rows["deepest vertex"] == rows["frames deeper than 1 cm"] == [reason, reason]

@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.pipelines.test_side_by_side import PROJECT, tiny_project
+from tests.pipelines.test_parallel_repro import PROJECT, tiny_project
 
 MARK = "HOIDATA_TEST_RUN"  # an environment variable that all processes of a run inherit
 MOMENTS = range(2 * int(os.environ.get("HOIDATA_CHAOS", "1")))
@@ -28,8 +28,8 @@ time.sleep(60)
 REPRO = """
 from hoidata.lifetime import run_interruptibly
 def main():
-    from pipelines.side_by_side import reproduce_side_by_side
-    return len(reproduce_side_by_side([], 2).failed)
+    from pipelines.parallel_repro import reproduce_in_parallel
+    return len(reproduce_in_parallel([], 2).failed)
 if __name__ == "__main__":
     run_interruptibly(main)
 """

@@ -22,6 +22,7 @@ import psutil
 import pytest
 
 from hoidata.errors import BadInput, MissingResource
+from pipelines.parallel_repro import CODE
 from pipelines.prefect_hook import key_for
 from pipelines.prefect_server import (
     KEY_FILE,
@@ -32,7 +33,6 @@ from pipelines.prefect_server import (
     wait_until_healthy,
     write_key,
 )
-from pipelines.side_by_side import CODE
 from tests.pipelines.prefect_up import hoidata_up, running_engine, wait_until
 
 FOREIGN = "http://evil.example"

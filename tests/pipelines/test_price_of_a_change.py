@@ -15,8 +15,8 @@ import pytest
 import yaml
 
 from pipelines.lineage.graph import Stage, read_graph
+from pipelines.parallel_repro import CODE
 from pipelines.params import read_file, read_params
-from pipelines.side_by_side import CODE
 
 PROJECT = Path(__file__).parents[2]
 ARCHITECTURE = PROJECT / "ARCHITECTURE.md"

@@ -10,9 +10,9 @@ import yaml
 from typer.testing import CliRunner
 
 from hoidata.errors import BadInput
-from hoidata.files.sealed import read_metadata
+from hoidata.files.checksums import read_metadata
 from pipelines.cli import app
-from pipelines.side_by_side import CODE
+from pipelines.parallel_repro import CODE
 from tests.builders.folders import kept, moved
 
 pytestmark = [pytest.mark.slow, pytest.mark.first]

@@ -8,14 +8,14 @@ import pytest
 from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets import get_adapter
 from hoidata.hands import load_embedded_hands, load_mano_hands
-from hoidata.store.info import stand_in_note
+from hoidata.store.info import embedded_hand_warning
 from hoidata.store.store import open_store
 from pipelines.commands.adapters import _hands
 from pipelines.commands.store_facts import fact_rows
 from pipelines.exports.describe import Description, dataset_card
 from pipelines.exports.motion import WORLD
 from pipelines.pages.report import _stand_ins
-from pipelines.showing import write_stored_clip
+from pipelines.show_pages import write_stored_clip
 from tests.builders import arctic, grab, h2o, hoi4d, hot3d, oakink2, taco
 from tests.builders.mano import write_mano_pickle
 
@@ -59,7 +59,7 @@ def test_generated_files_fitted_hands_and_mano_have_no_warning(tmp_path: Path) -
     )
     facts = {"dataset": "h2o", "synthetic": False, "hand_model": {"name": "embedded"}}
     shapes = {"betas per frame": True, "betas per sequence": True, "personal mesh": True, "fitted": False}
-    has_note = {shape: bool(stand_in_note(facts | {"hand_convention": {"shape": shape}})) for shape in shapes}
+    has_note = {shape: bool(embedded_hand_warning(facts | {"hand_convention": {"shape": shape}})) for shape in shapes}
     assert has_note == shapes
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hoidata.files.sealed import read_metadata
-from pipelines.side_by_side import CODE
+from hoidata.files.checksums import read_metadata
+from pipelines.parallel_repro import CODE
 
 pytestmark = pytest.mark.long
 FOLDER = Path(__file__).with_name("toy_family")

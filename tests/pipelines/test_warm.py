@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from hoidata import processor
-from hoidata.processor import processor_name, same_kernels
+from hoidata.processor import portable_kernels, processor_name
 from pipelines.warm import KILLED, SOCKET, WarmProcess, run_warm
 from tests.pipelines.test_interrupts import until
 
@@ -130,7 +130,7 @@ def test_without_a_warm_process_a_stage_runs_in_a_new_process(monkeypatch, tmp_p
     assert run_warm("act", []) is None
 
 
-needs_avx2 = pytest.mark.skipif(not same_kernels(), reason="this processor has no AVX2")
+needs_avx2 = pytest.mark.skipif(not portable_kernels(), reason="this processor has no AVX2")
 # A BLAS sum and a NumPy function, which both have different kernels per processor generation.
 COMPUTE = """
 import hashlib, numpy
@@ -191,9 +191,9 @@ def test_a_warm_stage_and_its_workers_use_the_same_kernels(monkeypatch, tmp_path
 def test_kernels_are_not_set_without_avx2_or_on_another_system(monkeypatch, tmp_path: Path) -> None:
     (tmp_path / "cpuinfo").write_text("processor: 0\nflags\t\t: fpu sse sse4_2 avx\n")
     monkeypatch.setattr(processor, "_CPUINFO", tmp_path / "cpuinfo")
-    assert same_kernels() == {}
+    assert portable_kernels() == {}
     monkeypatch.setattr(processor, "_CPUINFO", tmp_path / "none")
-    assert same_kernels() == {}
+    assert portable_kernels() == {}
 
 
 def test_the_processor_name_is_that_of_the_system(monkeypatch, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, hand_track
-from hoidata.clips.recording import HandRecording, OwnHandTrack
+from hoidata.clips.recording import HandRecording, SourceHandTrack
 from hoidata.dataset_folders import facts_of_adapter
 from hoidata.datasets.base import AdapterBase, DatasetPart, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.manipnet.hand import (
@@ -269,10 +269,10 @@ def read_hand_recording(raw: RawTree, key: SequenceKey) -> HandRecording:
     )
 
 
-def _hand_track(motion: BvhMotion) -> OwnHandTrack:
+def _hand_track(motion: BvhMotion) -> SourceHandTrack:
     wrist_m = (motion.root_position + motion.offsets[0]) * METRES_PER_UNIT
     rotvec = rotmat_to_rotvec(angles_yxz_to_rotmat(motion.angles_yxz_rad))
-    return OwnHandTrack(wrist_m.astype(np.float32), rotvec.astype(np.float32))
+    return SourceHandTrack(wrist_m.astype(np.float32), rotvec.astype(np.float32))
 
 
 def keypoints_m(motion: BvhMotion, side: Side, tips: dict[str, np.ndarray]) -> np.ndarray:

@@ -14,7 +14,7 @@ from hoidata.annotation.encoders import HashEncoder
 from hoidata.annotation.grammar import default_grammar
 from hoidata.annotation.hand_choice import HAND_TYPES, choose_hand, find_mentions, most_similar_hand, select_hand
 from hoidata.annotation.prompts import read_prompt
-from hoidata.annotation.sentences import four_sentences
+from hoidata.annotation.sentences import english_sentences
 
 LEFT = """
 lefty grabs the mug | LH grasp | lift the box with the left hadn | southpaw pours the milk | use your lefthand
@@ -94,7 +94,7 @@ def test_the_rules_read_every_verb_and_every_object_of_the_table_in_all_forms_an
     pairs = [(verb, "box") for verb in grammar.verbs] + [("lift", noun) for noun in grammar.nouns]
     for verb, noun in pairs:
         for hand in HAND_TYPES:
-            for sentence in four_sentences(verb, noun, hand):
+            for sentence in english_sentences(verb, noun, hand):
                 assert select_hand(sentence).hand == hand, sentence
 
 

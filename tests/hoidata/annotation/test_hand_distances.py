@@ -9,7 +9,7 @@ import pytest
 
 from hoidata.annotation.stage import annotate_store
 from hoidata.clips import SIDES, Clip, Side
-from hoidata.contact.maps import acting_hands
+from hoidata.contact.maps import find_active_hands
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.arrays import read_npz, write_npz
@@ -51,7 +51,7 @@ def annotated(root: Path) -> AnnotatedStore:
 def measured(annotated: AnnotatedStore, clip_id: str) -> HandEvidence:
     clip = annotated.clip(clip_id)
     joints: dict[Side, np.ndarray] = {side: annotated.joints(clip_id, side) for side in SIDES}
-    return acting_hands(clip, joints, ProximityIndex(sample_points(clip.object.model)))
+    return find_active_hands(clip, joints, ProximityIndex(sample_points(clip.object.model)))
 
 
 def test_the_kept_distances_are_the_measured_ones_of_the_same_clip(annotated: AnnotatedStore) -> None:

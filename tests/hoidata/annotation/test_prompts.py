@@ -8,7 +8,7 @@ import pytest
 
 from hoidata.annotation.hand_choice import HAND_TYPES
 from hoidata.annotation.prompts import Lexicon, read_prompt
-from hoidata.annotation.sentences import four_sentences, reference_sentences, reference_words
+from hoidata.annotation.sentences import english_sentences, reference_sentences, reference_words
 from hoidata.datasets.arctic import files as arctic
 from hoidata.datasets.grab import words as grab
 from hoidata.datasets.grab.words import OBJECTS
@@ -45,7 +45,7 @@ def test_every_sentence_of_a_recorded_pair_reads_back(dataset, count: int) -> No
     assert len(set(dataset.PAIRS)) == len(dataset.PAIRS) == count
     for verb, noun in dataset.PAIRS:
         for hand in HAND_TYPES:
-            for sentence in four_sentences(verb, noun, hand):
+            for sentence in english_sentences(verb, noun, hand):
                 reading = read_prompt(sentence)
                 assert (reading.verb, reading.object_words, reading.hand.hand) == (verb, noun, hand), sentence
 
@@ -53,7 +53,7 @@ def test_every_sentence_of_a_recorded_pair_reads_back(dataset, count: int) -> No
 @pytest.mark.slow
 def test_all_prompts_over_all_verbs_objects_and_hands_read_back() -> None:
     assert len(PAIRS) == 8 * 11 + 29 * 51 + 11 * 11
-    hand, noun_accuracy, verb = shares(four_sentences)
+    hand, noun_accuracy, verb = shares(english_sentences)
     assert hand == 1
     assert noun_accuracy >= 0.999
     assert verb >= 0.99

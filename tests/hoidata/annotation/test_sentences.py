@@ -16,7 +16,7 @@ from hoidata.annotation.grammar import (
     mass_nouns,
     regular_forms,
 )
-from hoidata.annotation.sentences import four_sentences, reference_sentences
+from hoidata.annotation.sentences import english_sentences, reference_sentences
 from hoidata.errors import BadInput
 
 
@@ -26,7 +26,7 @@ def table_rows(kind: str) -> list[dict[str, str]]:
 
 
 def test_the_forms_are_those_of_the_paper() -> None:
-    assert four_sentences("place", "book", "both") == (
+    assert english_sentences("place", "book", "both") == (
         "Place a book with both hands.",
         "A book is placed by both hands.",
         "Both hands place a book.",
@@ -48,7 +48,7 @@ def test_the_forms_are_those_of_the_paper() -> None:
     ],
 )
 def test_sentences_of_known_words_read_right(verb: str | None, words: str, hand, expected: str) -> None:
-    assert expected in four_sentences(verb, words, hand)
+    assert expected in english_sentences(verb, words, hand)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_sentences_of_known_words_read_right(verb: str | None, words: str, hand,
     ],
 )
 def test_a_verb_and_an_object_are_said_as_a_person_says_them(verb: str, words: str, hand, expected: str) -> None:
-    assert expected in four_sentences(verb, words, hand)
+    assert expected in english_sentences(verb, words, hand)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_a_verb_and_an_object_are_said_as_a_person_says_them(verb: str, words: s
     ],
 )
 def test_sentences_of_unknown_words_follow_the_rules(verb: str, words: str, expected: str) -> None:
-    assert four_sentences(verb, words, "left")[1] == expected
+    assert english_sentences(verb, words, "left")[1] == expected
 
 
 def test_every_verb_and_object_of_the_table_stands_in_its_sentences_as_written() -> None:
@@ -127,13 +127,13 @@ def test_every_verb_and_object_of_the_table_stands_in_its_sentences_as_written()
     for entry in table_rows("verb"):
         if (entry["base"], "*") in phrases.verbs:
             continue
-        sentences = four_sentences(entry["base"], "box", "left")
+        sentences = english_sentences(entry["base"], "box", "left")
         assert sentences[0].lower().startswith(entry["base"] + " a box")
         assert f" is {entry['past_participle']} by the left hand." in sentences[1]
         assert sentences[2] == f"The left hand {entry['third_singular']} a box."
         assert sentences[3].lower().startswith(entry["gerund"] + " a box")
     for entry in table_rows("object"):
-        sentences = four_sentences("lift", entry["base"], "both")
+        sentences = english_sentences("lift", entry["base"], "both")
         is_phrase = entry["base"] in phrases.nouns
         words = phrases.nouns[entry["base"]].format(entry["base"]) if is_phrase else entry["noun_phrase"]
         assert sentences[2] == f"Both hands lift {words}."
@@ -205,7 +205,7 @@ MADE_UP_NOUN = st.from_regex(r"([a-z]{2,8} )?[a-z]{3,9}", fullmatch=True)
 @example("aa", "is aaa", "left")
 @given(MADE_UP_VERB, MADE_UP_NOUN, st.sampled_from(["left", "right", "both"]))
 def test_made_up_words_never_break_article_agreement_or_shape(verb: str, noun: str, hand) -> None:
-    sentences = four_sentences(verb, noun, hand)
+    sentences = english_sentences(verb, noun, hand)
     assert all(re.fullmatch(r"[A-Z][^.]*[a-z]\.", sentence) and "  " not in sentence for sentence in sentences)
     hands = "both hands" if hand == "both" else f"the {hand} hand"
     imperative, passive, subject, gerund = (sentence[0].lower() + sentence[1:-1] for sentence in sentences)
@@ -242,7 +242,7 @@ MASS = {entry["base"] for entry in table_rows("object") if entry["number"] == "m
 @pytest.mark.parametrize("words", ["", "  ", "--"])
 def test_a_sentence_without_an_object_is_refused(words: str) -> None:
     with pytest.raises(BadInput, match="object of a sentence"):
-        four_sentences("lift", words, "left")
+        english_sentences("lift", words, "left")
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hoidata.batches.dataset import HoiDataset, collate
-from hoidata.batches.sight import Sight
+from hoidata.batches.frame_selection import FrameSelection
 from hoidata.clips import SIDES, Clip, ObjectTrack
 from hoidata.clips.features import upright
 from hoidata.errors import BadInput
@@ -173,7 +173,7 @@ def test_random_crops_repeat_with_the_seed_and_reach_the_last_window(clips: Clip
 
 def test_collate_pads_with_zeros_and_masks_what_is_missing(clips: Clips) -> None:
     samples = list(HoiDataset(clips, "train"))
-    batch = collate(samples, Sight.everything([30, 12, 45]))
+    batch = collate(samples, FrameSelection.everything([30, 12, 45]))
     assert batch.hands.shape == (3, 2, 45, 99)
     assert batch.lengths.tolist() == [30, 12, 45]
     assert batch.frames.sum(1).tolist() == [30, 12, 45]
@@ -192,7 +192,7 @@ def test_collate_pads_with_zeros_and_masks_what_is_missing(clips: Clips) -> None
 def test_a_batch_reads_only_the_entries_of_the_frames_it_chose(clips: Clips) -> None:
     samples = list(HoiDataset(clips, "train"))
     frames = np.array([[0, 29], [3, 4], [7, 44]])
-    clip, side, frame_index, joint, point = collate(samples, Sight(frames)).entries.T
+    clip, side, frame_index, joint, point = collate(samples, FrameSelection(frames)).entries.T
     assert point.tolist() == frames.flatten().tolist()
     assert (clip.tolist(), frame_index.tolist()) == ([0, 0, 1, 1, 2, 2], [0, 1] * 3)
     assert (joint.tolist(), set(side.tolist())) == ((point % 21).tolist(), {1})
@@ -200,10 +200,10 @@ def test_a_batch_reads_only_the_entries_of_the_frames_it_chose(clips: Clips) -> 
 
 def test_every_clip_shows_a_frame_of_each_interval_and_every_entry_is_drawn_alike(clips: Clips) -> None:
     samples, random = list(HoiDataset(clips, "train")), np.random.default_rng(0)
-    sight = Sight.drawn([30, 12, 45], 4, 3, random)
+    sight = FrameSelection.drawn([30, 12, 45], 4, 3, random)
     edges = np.array([[30], [12], [45]]) * np.arange(5) // 4
     assert ((edges[:, :-1] <= sight.frames) & (sight.frames <= edges[:, 1:])).all()
-    drawn = [collate(samples, Sight(sight.frames, 3, random)).entries for _ in range(400)]
+    drawn = [collate(samples, FrameSelection(sight.frames, 3, random)).entries for _ in range(400)]
     assert {len(entries) for entries in drawn} == {3}
     counts = np.unique(torch.cat(drawn)[:, [0, 2]].numpy(), axis=0, return_counts=True)[1]
     assert len(counts) == 12  # each of the 12 frames has one entry, expected 100 times

@@ -10,7 +10,7 @@ from hoidata.clips import SIDES
 from hoidata.clips.clip import FPS, ObjectTrack
 from hoidata.clips.features import hand_features, object_features, upright
 from hoidata.clips.quarantine import Quarantined
-from hoidata.clips.recording import HandRecording, OwnHandTrack
+from hoidata.clips.recording import HandRecording, SourceHandTrack
 from hoidata.clips.slip import MOVING_CM_S, joint_slips_cm_s
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
@@ -95,7 +95,7 @@ def test_frames_of_a_recording_keep_hands_object_and_usable_together():
     clip, hand = build_clip(), mano_hand(load_embedded_hands(), "right")
     rng = np.random.default_rng(0)
     joints = len(hand.parents) if hasattr(hand, "parents") else 16
-    tracks = {side: OwnHandTrack(rng.normal(size=(30, 3)), rng.normal(0, 0.3, (30, joints, 3))) for side in SIDES}
+    tracks = {side: SourceHandTrack(rng.normal(size=(30, 3)), rng.normal(0, 0.3, (30, joints, 3))) for side in SIDES}
     usable = np.arange(30) != 4
     whole = HandRecording(
         dataset="test",

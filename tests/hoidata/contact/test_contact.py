@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips import SIDES, Clip, ObjectTrack
-from hoidata.contact.maps import acting_hands, contact_maps, distance_entries, touched_frames
+from hoidata.contact.maps import contact_maps, distance_entries, find_active_hands, touched_frames
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.contact.stage import contact_store
 from hoidata.errors import BadInput
@@ -73,7 +73,7 @@ def test_contact_maps_equal_brute_force(scene: tuple[Clip, Joints, SampledPoints
 
 def test_hand_evidence_equals_brute_force(scene: tuple[Clip, Joints, SampledPoints]) -> None:
     clip, joints, points = scene
-    evidence = acting_hands(clip, joints, ProximityIndex(points))
+    evidence = find_active_hands(clip, joints, ProximityIndex(points))
     for side in SIDES:
         truth = brute_force(clip, joints[side], points).min(axis=(1, 2))
         np.testing.assert_allclose(evidence.distance_m[side], truth, atol=1e-12)
@@ -152,14 +152,14 @@ def hovering(left_m: float, right_m: float) -> Joints:
 )
 def test_a_hand_acts_below_2_cm_and_not_above(plane, left_m: float, right_m: float, hand_type: str | None) -> None:
     clip, points = plane
-    evidence = acting_hands(clip, hovering(left_m, right_m), ProximityIndex(points))
+    evidence = find_active_hands(clip, hovering(left_m, right_m), ProximityIndex(points))
     assert evidence.hand_type == hand_type
     assert evidence.closest_m("left") == pytest.approx(left_m)
 
 
 def test_another_threshold_needs_no_new_distances(plane) -> None:
     clip, points = plane
-    evidence = acting_hands(clip, hovering(0.012, 0.027), ProximityIndex(points))
+    evidence = find_active_hands(clip, hovering(0.012, 0.027), ProximityIndex(points))
     judged = [evidence.at_threshold(threshold).hand_type for threshold in (0.01, 0.02, 0.03)]
     assert judged == [None, "left", "both"]
 
@@ -168,7 +168,7 @@ def test_an_invalid_frame_is_no_evidence(plane) -> None:
     clip, points = plane
     clip = with_hand(clip, "left", valid=np.array([True, False]))
     joints, index = hovering(0.01, 0.01), ProximityIndex(points)
-    assert acting_hands(clip, joints, index).hand_type == "right"
+    assert find_active_hands(clip, joints, index).hand_type == "right"
     assert len(distance_entries(clip, joints, index)["left"]) == 0
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.contact.maps import acting_hands
+from hoidata.contact.maps import find_active_hands
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.sampling import sample_points
@@ -42,7 +42,7 @@ def test_frames_words_and_hand_are_those_of_the_truth(corpus, pairs):
         assert (clip.verb, clip.object_words, clip.subject) == (truth.verb, truth.object_words, truth.subject)
         index = ProximityIndex(sample_points(clip.object.model))
         joints = {side: store.joints(clip.clip_id, side) for side in ("left", "right")}
-        assert acting_hands(clip, joints, index).hand_type == truth.hand_type
+        assert find_active_hands(clip, joints, index).hand_type == truth.hand_type
         assert clip.labelled_hand in (None, truth.hand_type)
 
 

@@ -23,7 +23,7 @@ from hoidata.hands import load_embedded_hands
 from hoidata.splits.definitions import definitions_for, published
 from hoidata.store.store import open_store
 from tests.builders.corruption import CANARY, Corrupt
-from tests.builders.formulas import has_its_own_side, seated_person, sits_as_described
+from tests.builders.formulas import has_correct_handedness, is_seated_correctly, seated_person
 
 HERE = Path(__file__).parent
 
@@ -183,13 +183,13 @@ class SeatedPersonContract:
     edges_seen = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
 
     def test_the_numbers_of_each_hand_bend_a_hand_of_that_side(self, look):
-        assert has_its_own_side(look(seated_person())[0])
-        assert not has_its_own_side(look(seated_person(swapped=True))[0])
+        assert has_correct_handedness(look(seated_person())[0])
+        assert not has_correct_handedness(look(seated_person(swapped=True))[0])
 
     @pytest.mark.parametrize("axis", [0, 1, 2])
     def test_the_world_is_not_seen_in_a_mirror(self, look, axis):
-        assert sits_as_described(*look(seated_person()), self.edges_seen)
-        assert not sits_as_described(*look(seated_person(mirrored=axis)), self.edges_seen)
+        assert is_seated_correctly(*look(seated_person()), self.edges_seen)
+        assert not is_seated_correctly(*look(seated_person(mirrored=axis)), self.edges_seen)
 
 
 def fingerprint(value: Any) -> str:

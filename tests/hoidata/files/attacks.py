@@ -17,9 +17,9 @@ from hoidata.datasets.h2o.files import listed_segments
 from hoidata.datasets.hot3d.files import MAX_TABLE_BYTES, POSE_COLUMNS, hand_poses, object_poses
 from hoidata.datasets.manipnet.adapter import _read_tips
 from hoidata.datasets.manipnet.hand import ROOT_CHANNELS, parse_bvh, unpack_text
+from hoidata.files.checksums import read_metadata
 from hoidata.files.numpy_files import load_npz_arrays, load_npz_objects
 from hoidata.files.restricted_pickle import ARRAYS, restricted_load
-from hoidata.files.sealed import read_metadata
 from hoidata.files.torch_pickle import load_torch_pickle
 from hoidata.objects.mesh import LARGEST_MESH_BYTES, load_mesh, parse_obj
 from hoidata.objects.user_mesh import read_user_object

@@ -13,9 +13,16 @@ from hoidata.errors import BadInput
 from hoidata.files import load_npy, load_npy_object, load_npz_objects
 from hoidata.files.arrays import read_npz, write_npz
 from hoidata.files.atomic import canonical_json, sha256_bytes
+from hoidata.files.checksums import (
+    EMPTY_CHECKSUMS,
+    corrupted_part,
+    payload_digest,
+    read_metadata,
+    sealed,
+    verify_checksums,
+)
 from hoidata.files.npy_header import read_npy_header
 from hoidata.files.numpy_files import load_npz_arrays
-from hoidata.files.sealed import OPEN_SEAL, check_seal, payload_digest, read_metadata, seal_fault, sealed
 
 
 def npy_of_numpy_1(value):
@@ -332,9 +339,9 @@ def stored(tmp_path, **info):
 
 
 def test_a_sealed_file_is_whole_and_reads_as_any_safetensors_file(tmp_path):
-    path = stored(tmp_path, seal=OPEN_SEAL)
-    assert seal_fault(path) is None
-    check_seal(path)
+    path = stored(tmp_path, seal=EMPTY_CHECKSUMS)
+    assert corrupted_part(path) is None
+    verify_checksums(path)
     assert load(path.read_bytes())["weight"].tolist() == [0, 1, 2]
     assert (
         read_metadata(path)["seal"]["payload_sha256"] == payload_digest(path) == sha256_bytes(path.read_bytes()[-12:])
@@ -342,7 +349,7 @@ def test_a_sealed_file_is_whole_and_reads_as_any_safetensors_file(tmp_path):
 
 
 def test_a_flipped_bit_is_detected_and_assigned_to_its_half_of_the_file(tmp_path):
-    path = stored(tmp_path, seal=OPEN_SEAL)
+    path = stored(tmp_path, seal=EMPTY_CHECKSUMS)
     whole = path.read_bytes()
     start = 8 + int.from_bytes(whole[:8], "little")
     for number in range(len(whole)):
@@ -350,7 +357,7 @@ def test_a_flipped_bit_is_detected_and_assigned_to_its_half_of_the_file(tmp_path
         damaged[number] ^= 1 << number % 8
         path.write_bytes(damaged)
         try:
-            fault = seal_fault(path)
+            fault = corrupted_part(path)
         except BadInput:
             fault = "header"  # no longer the header of a checkpoint
         # A flipped digest of the weights counts as corrupted weights, because the two cases are indistinguishable.
@@ -358,14 +365,14 @@ def test_a_flipped_bit_is_detected_and_assigned_to_its_half_of_the_file(tmp_path
 
 
 def test_a_file_written_before_there_were_seals_is_not_accused(tmp_path):
-    assert seal_fault(stored(tmp_path)) is None
+    assert corrupted_part(stored(tmp_path)) is None
 
 
 def test_a_broken_seal_is_refused_with_the_half_that_was_changed(tmp_path):
-    path = stored(tmp_path, seal=OPEN_SEAL)
+    path = stored(tmp_path, seal=EMPTY_CHECKSUMS)
     path.write_bytes(path.read_bytes()[:-1] + b"\xff")
     with pytest.raises(BadInput, match="expected weights matching the checksum"):
-        check_seal(path)
+        verify_checksums(path)
 
 
 def test_metadata_other_than_an_object_is_refused(tmp_path):

@@ -14,14 +14,19 @@ from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.metrics import bimart
 from hoidata.metrics.evaluate import evaluate_store
-from hoidata.metrics.optional_metrics import BIMART_METRICS, OPTIONAL_LISTS, with_lists
+from hoidata.metrics.optional_metrics import BIMART_METRICS, OPTIONAL_LISTS, select_metrics
 from hoidata.metrics.registry import METRICS
-from hoidata.metrics.target_contact import DISTANCES_NAME, AskedDistances, read_asked_distances, write_asked_distances
+from hoidata.metrics.target_contact import (
+    DISTANCES_NAME,
+    TargetDistances,
+    read_target_distances,
+    write_target_distances,
+)
 from hoidata.objects.distance import is_closed
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
-from hoidata.surface.contact import PlacedHand
+from hoidata.surface.contact import HandInObjectFrame
 from tests.builders.clips import clip_of, flat_hand
 from tests.builders.objects import box_model, model_of, notebook, two_parts
 
@@ -140,7 +145,7 @@ def cut_box(half_m):
 
 def placed(points_m, hinge_rad):
     faces = np.zeros((0, 3), int)
-    return PlacedHand(points_m[None], np.zeros(1, int), np.array([hinge_rad]), faces=faces, n_frames=1)
+    return HandInObjectFrame(points_m[None], np.zeros(1, int), np.array([hinge_rad]), faces=faces, n_frames=1)
 
 
 def test_depth_as_released_takes_its_sign_from_the_whole_posed_mesh_though_each_part_is_open():
@@ -314,7 +319,7 @@ def target_of(clip, off_m=0.0, hand_vertices=None):
         ],
         axis=1,
     )
-    return AskedDistances(places, distance + off_m, used.astype(np.int32))
+    return TargetDistances(places, distance + off_m, used.astype(np.int32))
 
 
 def test_cm_is_the_distance_between_the_generated_and_the_target_map(make_clip, pair_of):
@@ -334,9 +339,9 @@ def test_cm_is_the_distance_between_the_generated_and_the_target_map(make_clip, 
 
 def test_target_distances_survive_the_file_to_a_tenth_of_a_millimetre(make_clip, tmp_path):
     targets = {"a~0": target_of(make_clip(4)), "b~0": target_of(make_clip(7)), "a~1": target_of(make_clip(4), 0.01)}
-    assert read_asked_distances(tmp_path / "clips") == {}
-    write_asked_distances(tmp_path, targets)
-    back = read_asked_distances(tmp_path / "clips")
+    assert read_target_distances(tmp_path / "clips") == {}
+    write_target_distances(tmp_path, targets)
+    back = read_target_distances(tmp_path / "clips")
     assert list(back) == list(targets)
     for name, target in targets.items():
         assert np.abs(back[name].place_m - target.place_m).max() < 1.5e-4
@@ -348,7 +353,7 @@ def test_target_distances_survive_the_file_to_a_tenth_of_a_millimetre(make_clip,
     for spoilt in ({"first": arrays["first"][::-1]}, {"place_first": arrays["place_first"] + 8}):
         np.savez(tmp_path / DISTANCES_NAME, **(arrays | spoilt))
         with pytest.raises(BadInput, match="motion_id"):
-            read_asked_distances(tmp_path / "clips")
+            read_target_distances(tmp_path / "clips")
 
 
 # --- computed on request
@@ -360,11 +365,11 @@ def test_optional_metrics_are_computed_only_on_request(write_annotated, moved, t
         replace(moved(c, (0, 0.01 * k, 0)), clip_id=f"{c.clip_id}~{k}") for c in clips.values() for k in (0, 1)
     ]
     write_store(tmp_path / "two" / "clips", predicted, generated_info("predicted"))
-    write_asked_distances(tmp_path / "two", {clip.clip_id: target_of(clip) for clip in predicted})
+    write_target_distances(tmp_path / "two", {clip.clip_id: target_of(clip) for clip in predicted})
     bimart_names = {metric.name for metric in BIMART_METRICS}
     plain = evaluate_store(tmp_path / "two" / "clips", root)
     assert not bimart_names & set(plain["figures"])
-    evaluation = evaluate_store(tmp_path / "two" / "clips", root, metrics=with_lists(["bimart"]))
+    evaluation = evaluate_store(tmp_path / "two" / "clips", root, metrics=select_metrics(["bimart"]))
     values, counts = evaluation["figures"], evaluation["counts"]
     assert {name: value for name, value in values.items() if name not in bimart_names} == plain["figures"]
     assert values["bimart_mul_cm"] == pytest.approx(1, abs=1e-4)
@@ -374,9 +379,9 @@ def test_optional_metrics_are_computed_only_on_request(write_annotated, moved, t
     needs_hinge = {name for name in bimart_names if "_art_" in name}
     assert bimart_names - set(values) == needs_hinge
     with pytest.raises(BadInput, match="bimart"):
-        with_lists(["bimart", "omomo"])
-    short = AskedDistances(*(array[:5] for array in target_of(predicted[1])))
-    write_asked_distances(tmp_path / "two", {predicted[1].clip_id: short})
+        select_metrics(["bimart", "omomo"])
+    short = TargetDistances(*(array[:5] for array in target_of(predicted[1])))
+    write_target_distances(tmp_path / "two", {predicted[1].clip_id: short})
     reasons = {item["clip_id"]: item["reason"] for item in evaluate_store(tmp_path / "two" / "clips", root)["left_out"]}
     assert "5 frames, not 12" in reasons[predicted[1].clip_id]
 

@@ -13,9 +13,9 @@ from hoidata.files.arrays import write_npz
 from hoidata.metrics import registry
 from hoidata.metrics.describe import readme
 from hoidata.metrics.evaluate import ClipResult, Sample, evaluate_store, intervals_of, match_predictions
-from hoidata.metrics.optional_metrics import with_lists
+from hoidata.metrics.optional_metrics import select_metrics
 from hoidata.metrics.registry import METRICS, is_better, metric, summarise
-from hoidata.metrics.target_contact import FILE_NAME, write_asked
+from hoidata.metrics.target_contact import FILE_NAME, write_target_contact
 from hoidata.store.annotated import load_annotated
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
@@ -221,11 +221,11 @@ def test_target_contact_maps_are_read_per_motion(write_annotated, tmp_path):
     assert "adherence" not in evaluate_store(store, root)["figures"]
     true = load_annotated(root).contact_of(RIGHT, "right") > 0
     for targets, adherence in (([(first, true)], 1), ([(first, ~true)], 0), ([(first, true), (second, ~true)], 0.5)):
-        write_asked(store.parent, {motion.clip_id: target for motion, target in targets})
+        write_target_contact(store.parent, {motion.clip_id: target for motion, target in targets})
         evaluation = evaluate_store(store, root)
         assert evaluation["figures"]["adherence"] == adherence
         assert evaluation["counts"]["adherence"] == {"clips": 1, "motions": len(targets), "values": len(targets)}
-    write_asked(store.parent, {first.clip_id: true[:-1]})
+    write_target_contact(store.parent, {first.clip_id: true[:-1]})
     reasons = {item["clip_id"]: item["reason"] for item in evaluate_store(store, root)["left_out"]}
     assert reasons == {first.clip_id: "the target contact map has 255 points, 256 expected"}
     write_npz(store.parent / FILE_NAME, {"motion_id": np.array([RIGHT]), "asked": true})
@@ -316,7 +316,7 @@ def test_unmeasured_metrics_are_listed_with_reason_and_number_of_clips(make_clip
         return replace(clip, object=replace(clip.object, model=sheet))
 
     root, clips = write_annotated_dataset(tmp_path / "annotated", open_clip)
-    all_metrics = with_lists(["bimart"])
+    all_metrics = select_metrics(["bimart"])
     evaluation = evaluate_store(written(tmp_path / "same", clips.values()), root, metrics=all_metrics)
     no_inside = {"the object has no inside": 2}
     for name in ("penetration_mm", "deep_share", "penetration_volume_cm3", "bimart_pen_1cm_corrected"):
@@ -336,9 +336,9 @@ def test_aligned_metrics_report_the_reason_for_motions_of_estimated_length(write
     root, clips = write_annotated()
     shorter = [named(clips[RIGHT].take(slice(0, 10)), f"{RIGHT}~{number}") for number in range(2)]
     write_store(tmp_path / "own", shorter, generated_info("predicted", length="own"))
-    evaluation = evaluate_store(tmp_path / "own", root, metrics=with_lists(["bimart"]))
+    evaluation = evaluate_store(tmp_path / "own", root, metrics=select_metrics(["bimart"]))
     reason = {"the family chose the length, so frames cannot be compared": 1}
-    aligned = [item.name for item in with_lists(["bimart"]) if item.aligned]
+    aligned = [item.name for item in select_metrics(["bimart"]) if item.aligned]
     assert len(aligned) == 3
     assert [evaluation["unmeasured"][name] for name in aligned] == [reason] * 3
     given_length = evaluate_store(written(tmp_path / "given", clips.values()), root)

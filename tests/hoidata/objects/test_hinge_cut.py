@@ -74,7 +74,7 @@ def test_the_closing_triangles_affect_depths_but_not_distances() -> None:
     closed = np.zeros(1)
     assert index.distance_m(cut, closed)[0, 0] == pytest.approx(SIDE_M / 2)
     assert index.depth_m(below, closed)[0, 0] == pytest.approx(0.01)
-    assert index.solid_note == "part 0 of cube: cut at the hinge closed; part 1 of cube: cut at the hinge closed"
+    assert index.repair_note == "part 0 of cube: cut at the hinge closed; part 1 of cube: cut at the hinge closed"
 
 
 def test_inside_the_moving_part_follows_the_hinge() -> None:
@@ -92,7 +92,7 @@ def test_a_hole_elsewhere_stays_open() -> None:
     index = SurfaceIndex(replace(model, faces=model.faces[~bottom]))
     assert not isinstance(index.solids[0], Solid)
     assert isinstance(index.solids[1], Solid)
-    assert index.solid_note == "part 0 of cube has no inside: it is open; part 1 of cube: cut at the hinge closed"
+    assert index.repair_note == "part 0 of cube has no inside: it is open; part 1 of cube: cut at the hinge closed"
 
 
 def test_holes_that_share_a_vertex_are_closed_one_by_one() -> None:

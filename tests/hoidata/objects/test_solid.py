@@ -51,7 +51,7 @@ def mug_depth(places: np.ndarray) -> np.ndarray:
 def test_the_cavity_of_a_mug_is_outside_and_its_wall_inside(grid_after: int) -> None:
     mug, rng = analytic_mug(), np.random.default_rng(0)
     index = solid_index(mug.vertices, mug.faces, grid_after)
-    assert index.solid_note is None
+    assert index.repair_note is None
     places = rng.uniform((-0.05, -0.05, -0.01), (0.05, 0.05, 0.11), (20_000, 3))
     expected = mug_depth(places)
     assert (expected > 0).sum() > 1000
@@ -103,7 +103,7 @@ def test_overlapping_shells_are_one_solid_and_an_inverted_shell_is_a_cavity() ->
 def test_a_small_hole_is_closed_and_reported() -> None:
     sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
     index = solid_index(sphere.vertices, sphere.faces[1:])
-    assert index.solid_note == "object: 1 small hole closed"
+    assert index.repair_note == "object: 1 small hole closed"
     places = np.array([[[0, 0, 0], [0, 0, 0.06], [0, 0, 0.03]]])
     np.testing.assert_allclose(index.depth_m(places, None)[0], [0.05, 0, 0.02], atol=5e-4)
     # The patch is not part of the surface: at the hole, the nearest triangle is next to it.
@@ -117,7 +117,7 @@ def test_a_cup_drawn_as_one_open_sheet_is_refused_with_the_reason() -> None:
     bowl = sphere.faces[sphere.triangles_center[:, 2] < 0]
     index = solid_index(sphere.vertices, bowl)
     assert not index.is_solid
-    assert index.solid_note == "object has no inside: it is open"
+    assert index.repair_note == "object has no inside: it is open"
     with pytest.raises(BadInput, match=r"encloses a solid.*it is open"):
         index.depth_m(np.zeros((1, 1, 3)), None)
     assert index.within(np.array([[[0, 0, -0.052]]]), None, 0.005)[0, 0]
@@ -204,7 +204,7 @@ def test_manipnet_s_open_cup_and_doubled_mug_are_repaired() -> None:
         path = Path(ROOT) / f"objects/Dining/{name}.obj.gz"
         mesh = parse_obj(gzip.decompress(path.read_bytes()).decode(), path)
         model = ObjectModel(name, 0.1 * mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), np.uint8))
-        said[name] = SurfaceIndex(model).solid_note
+        said[name] = SurfaceIndex(model).repair_note
     assert said["cup1"] == "cup1: 1 small hole closed"
     assert said["mug2"] == "mug2: 3320 triangles that lay double left out"
     assert said["mug1"] is None

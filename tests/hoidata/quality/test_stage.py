@@ -22,7 +22,7 @@ from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.quality import stage
 from hoidata.quality.stage import quality_store
-from hoidata.quality.thresholds import CLIP_MEASURES, DEFAULT_LIMITS, Limit, Thresholds, left_out_reasons
+from hoidata.quality.thresholds import CLIP_MEASURES, DEFAULT_LIMITS, Limit, Thresholds, exclusion_reasons
 from hoidata.store.store import open_store
 from tests.builders.clips import in_another_world, jumping
 from tests.builders.stores import write_clips
@@ -82,9 +82,9 @@ def test_every_clip_and_object_has_its_verdict_its_reasons_and_null_where_nothin
     }  # fmt: skip
     noted = json.loads((tmp_path / "quality" / "info.json").read_text())
     assert noted == {"thresholds": asdict(thresholds), "counts": counts}
-    assert left_out_reasons(tmp_path / "quality") == {"test/s1/1": f"left out by quality control: {jump}"}
+    assert exclusion_reasons(tmp_path / "quality") == {"test/s1/1": f"left out by quality control: {jump}"}
     with pytest.raises(MissingResource, match="stage 'quality'"):
-        left_out_reasons(tmp_path / "elsewhere")
+        exclusion_reasons(tmp_path / "elsewhere")
 
 
 def test_penetration_is_measured_in_an_object_divided_by_part_labels(make_clip, tmp_path):
@@ -110,7 +110,7 @@ def test_penetration_is_measured_in_an_object_divided_by_part_labels(make_clip, 
 def test_mesh_that_is_left_out_takes_its_clips_with_it(clips_folder, tmp_path):
     limits = {**DEFAULT_LIMITS, "open_edge_share": Limit(None, 0.0)}
     quality_store(clips_folder, tmp_path / "quality", thresholds=Thresholds(limits=limits), progress=False)
-    reasons = left_out_reasons(tmp_path / "quality")
+    reasons = exclusion_reasons(tmp_path / "quality")
     assert list(reasons) == ["test/s1/1", "test/s1/3"]
     assert "object open_box: share of edges at a hole" in reasons["test/s1/3"]
 
@@ -193,7 +193,7 @@ def test_store_without_clips_gives_empty_tables(tmp_path):
     write_clips(tmp_path / "clips", [])
     counts = quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
     assert set(counts.values()) == {0}
-    assert left_out_reasons(tmp_path / "quality") == {}
+    assert exclusion_reasons(tmp_path / "quality") == {}
 
 
 def late_hands(clip: Clip, late: int) -> Clip:

@@ -15,19 +15,19 @@ from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.realism import VARIANTS, score
-from hoidata.physics.scene import capsules_there, clip_scene
-from hoidata.refinement import HoldSettings, carried_share, hold_clip, hold_hands
+from hoidata.physics.scene import capsules_or_nan, clip_scene
+from hoidata.refinement import GraspSettings, carried_fraction, refine_grasps, refined_tracks
 from hoidata.refinement.grasp_solver import spline_weights
 from hoidata.refinement.holding import _Load, _passed
 from hoidata.refinement.kernels import lower_capsules
 from hoidata.refinement.object_field import ObjectField
-from hoidata.refinement.regrasping import RegraspSettings
+from hoidata.refinement.regrasping import GraspSearchSettings
 from tests.builders.clips import DOWN, clip_of
 from tests.builders.objects import box_model, two_parts
 
 PAIR = load_embedded_hands()
-AS_GENERATED = HoldSettings(
-    regrasp=RegraspSettings(tries=0)
+AS_GENERATED = GraspSettings(
+    regrasp=GraspSearchSettings(tries=0)
 )  # the search of another grasp is tested in test_regrasping.py
 FRAMES = 44
 BOX = box_model((0.06, 0.30, 0.06))
@@ -75,7 +75,7 @@ def pushed() -> tuple[Clip, dict[Side, HandTrack]]:
         top = position_m + (rotation @ np.array([0, y, 0.03]))
         hands[side] = pressed(side, top, 0.012, 0.004, rotation)
     clip = clip_of("toy/s1/a", object_track, hands)
-    return clip, hold_hands(PAIR, clip, AS_GENERATED)
+    return clip, refined_tracks(PAIR, clip, AS_GENERATED)
 
 
 def in_object(clip: Clip, side: Side, track: HandTrack) -> np.ndarray:
@@ -108,13 +108,13 @@ def test_the_carried_fraction_is_0_without_hands_at_the_box_and_1_if_it_never_ri
         clip.object, translation_m=np.zeros((FRAMES, 3), np.float32), rotvec=np.zeros((FRAMES, 3), "f4")
     )
     assert (
-        carried_share(PAIR, replace(refined_clip, hands=away))
-        == carried_share(PAIR, replace(refined_clip, hands=absent))
+        carried_fraction(PAIR, replace(refined_clip, hands=away))
+        == carried_fraction(PAIR, replace(refined_clip, hands=absent))
         == 0
     )
-    assert carried_share(PAIR, replace(refined_clip, hands=absent, object=resting_object)) == 1
+    assert carried_fraction(PAIR, replace(refined_clip, hands=absent, object=resting_object)) == 1
     realism = score(clip_scene(refined_clip, PAIR), VARIANTS["SI"])
-    assert carried_share(PAIR, refined_clip) == pytest.approx(realism.passed.mean(), abs=0.3)
+    assert carried_fraction(PAIR, refined_clip) == pytest.approx(realism.passed.mean(), abs=0.3)
 
 
 def test_a_hand_is_unchanged_far_from_its_grasp(pushed):
@@ -142,7 +142,7 @@ def test_a_grasp_is_extended_while_the_object_moves_in_no_hand():
     )
     slip_m = []
     for carry in (0, 8):
-        skin = in_object(clip, "right", hold_hands(PAIR, clip, HoldSettings(carry=carry))["right"])
+        skin = in_object(clip, "right", refined_tracks(PAIR, clip, GraspSettings(carry=carry))["right"])
         slip_m.append(np.linalg.norm(np.diff(skin[5:41], axis=0), axis=-1).max())
     assert slip_m[0] > 0.003
     assert slip_m[1] < 1e-6
@@ -165,19 +165,19 @@ def coming_to_a_carried_box() -> tuple[Clip, dict[Side, HandTrack]]:
     left = hands["left"]
     left = replace(left, wrist_m=(position_m + left.wrist_m[20] - position_m[20]).astype(np.float32))
     clip = clip_of("toy/s1/e", ObjectTrack(BOX, still, position_m.astype(np.float32)), {**hands, "left": left})
-    return clip, hold_hands(PAIR, clip)
+    return clip, refined_tracks(PAIR, clip)
 
 
 def test_hands_without_contact_and_invalid_frames_are_unchanged(pushed):
     clip, _ = pushed
     away = {side: replace(track, wrist_m=track.wrist_m + np.float32(1)) for side, track in clip.hands.items()}
-    refined = hold_hands(PAIR, replace(clip, hands=away))
+    refined = refined_tracks(PAIR, replace(clip, hands=away))
     for side in SIDES:
         for name in ("wrist_m", "global_orient", "hand_pose"):
             assert np.array_equal(getattr(refined[side], name), getattr(away[side], name))
     valid = np.arange(FRAMES) < 30
     absent_from_30 = replace(clip, hands={side: replace(track, valid=valid) for side, track in clip.hands.items()})
-    for side, track in hold_hands(PAIR, absent_from_30).items():
+    for side, track in refined_tracks(PAIR, absent_from_30).items():
         assert np.array_equal(track.hand_pose[30:], clip.hands[side].hand_pose[30:])
         assert not np.array_equal(track.hand_pose[12:30], clip.hands[side].hand_pose[12:30])
 
@@ -200,7 +200,7 @@ def opening(middle_m: float) -> tuple[Clip, RigidTransform]:
 
 def test_a_hand_on_a_lid_stays_still_on_the_lid_while_it_opens():
     clip, world_from_lid = opening(0.2)
-    refined = hold_hands(PAIR, clip)["right"]
+    refined = refined_tracks(PAIR, clip)["right"]
     on_lid = world_from_lid.inverse() @ track_vertices(refined, PAIR.right).astype(np.float64)
     assert np.linalg.norm(np.diff(on_lid[14:33], axis=0), axis=-1).max() < 1e-6
     on_base = track_vertices(refined, PAIR.right)[HELD]
@@ -215,9 +215,9 @@ def test_a_hand_across_the_hinge_avoids_the_part_it_does_not_grasp(monkeypatch):
         field, frames = ObjectField(clip.object), np.arange(FRAMES)[HELD]
         return float((field.distances_to(0, skin, frames)[0] < 0.01).mean())
 
-    avoiding = hold_hands(PAIR, clip)["right"]
+    avoiding = refined_tracks(PAIR, clip)["right"]
     monkeypatch.setattr("hoidata.refinement.holding._passed", lambda object_track, grasps: None)
-    unchanged = hold_hands(PAIR, clip)["right"]
+    unchanged = refined_tracks(PAIR, clip)["right"]
     assert skin_near_base(unchanged) > 0.03
     assert skin_near_base(avoiding) < 0.3 * skin_near_base(unchanged)
     on_lid = world_from_lid.inverse() @ track_vertices(avoiding, PAIR.right).astype(np.float64)
@@ -235,11 +235,11 @@ def test_a_hand_grasps_the_same_part_in_all_attempts(monkeypatch):
         return original(self, points_m, touching, part)
 
     monkeypatch.setattr(ObjectField, "part_touched", part_touched)
-    monkeypatch.setattr("hoidata.refinement.holding._Load.carried_share", lambda self, pair, hands: 0.0)
-    hold_hands(PAIR, clip, AS_GENERATED)
+    monkeypatch.setattr("hoidata.refinement.holding._Load.carried_fraction", lambda self, pair, hands: 0.0)
+    refined_tracks(PAIR, clip, AS_GENERATED)
     rights = [part for part in requested_parts if part is not None]
     assert set(rights) == {1}
-    assert len(rights) == len(HoldSettings().reach_m) - 1
+    assert len(rights) == len(GraspSettings().reach_m) - 1
 
 
 def test_skin_is_attracted_from_farther_away_if_the_object_is_not_carried():
@@ -252,7 +252,9 @@ def test_skin_is_attracted_from_farther_away_if_the_object_is_not_carried():
         hands[side] = pressed(side, position_m + np.array([0, sign * 0.05, 0]), -0.004, 0.0, rotation)
     clip = clip_of("toy/s1/c", object_track, hands)
     for reach in ((0.0005,), (0.0005, 0.03)):
-        refined = hold_hands(PAIR, clip, replace(AS_GENERATED, reach_m=reach, keypoint_m=(0.006, 0.02)[: len(reach)]))
+        refined = refined_tracks(
+            PAIR, clip, replace(AS_GENERATED, reach_m=reach, keypoint_m=(0.006, 0.02)[: len(reach)])
+        )
         fractions.append(score(clip_scene(replace(clip, hands=refined), PAIR, -0.05), VARIANTS["SI"]).share)
         # Finger poses stay possible.
         assert (
@@ -266,8 +268,11 @@ def test_equal_input_gives_equal_bytes_and_a_clip_without_weight_is_refined(push
     clip, refined = pushed
     corners, sheet = BOX.vertices_m * [1, 1, 0], clip.object
     paper = replace(clip, object=replace(sheet, model=replace(BOX, name="sheet", vertices_m=corners)))
-    assert all(np.isfinite(track.wrist_m).all() for track in hold_hands(PAIR, paper).values())
-    again, floating = hold_hands(PAIR, clip, AS_GENERATED), hold_hands(PAIR, replace(clip, gravity=None))
+    assert all(np.isfinite(track.wrist_m).all() for track in refined_tracks(PAIR, paper).values())
+    again, floating = (
+        refined_tracks(PAIR, clip, AS_GENERATED),
+        refined_tracks(PAIR, replace(clip, gravity=None)),
+    )
     for side in SIDES:
         assert again[side].wrist_m.tobytes() == refined[side].wrist_m.tobytes()
         assert np.isfinite(floating[side].hand_pose).all()
@@ -292,7 +297,7 @@ def test_a_hand_that_grasps_at_two_positions_is_not_averaged_over_them():
     track = replace(track, wrist_m=(track.wrist_m + lift_m[:, None] * [0, 0, 1]).astype(np.float32))
     away = replace(track, wrist_m=track.wrist_m + 1)
     clip = clip_of("toy/s1/e", ObjectTrack(BOX, still, still), {"left": away, "right": track})
-    refined = hold_hands(PAIR, clip)["right"]
+    refined = refined_tracks(PAIR, clip)["right"]
     for start, stop in ((11, 15), (25, 36)):
         assert abs(refined.wrist_m - track.wrist_m)[start:stop, 1].max() < 0.01
 
@@ -308,7 +313,7 @@ def test_between_two_grasps_on_a_moving_object_the_hand_uses_all_frames():
     track = pressed("right", top, 0.001, 0.0, rotation)
     away = replace(track, wrist_m=track.wrist_m + 1)
     clip = clip_of("toy/s1/e", ObjectTrack(BOX, still, position_m.astype(np.float32)), {"left": away, "right": track})
-    refined_m = hold_hands(PAIR, clip, AS_GENERATED)["right"].wrist_m - position_m
+    refined_m = refined_tracks(PAIR, clip, AS_GENERATED)["right"].wrist_m - position_m
     original_m = track.wrist_m - position_m
     wrists_m = refined_m, original_m
     step_m, original_step_m = (np.linalg.norm(np.diff(wrist[12:36], axis=0), axis=1).max() for wrist in wrists_m)
@@ -327,10 +332,10 @@ def test_skin_is_not_attracted_through_the_other_hand():
     depths_mm = []
     for hands in ({"left": left, "right": right}, {"left": left, "right": replace(right, wrist_m=right.wrist_m + 1)}):
         clip = clip_of("toy/s1/h", ObjectTrack(BOX, still, still), hands)
-        refined = hold_hands(PAIR, clip, AS_GENERATED)["left"]
+        refined = refined_tracks(PAIR, clip, AS_GENERATED)["left"]
         between = np.full((FRAMES, 778), np.inf)
         skin = track_vertices(refined, PAIR["left"]).astype(np.float64)
-        lower_capsules(*capsules_there(right, PAIR["right"]), skin, between, np.zeros((FRAMES, 778, 3)))
+        lower_capsules(*capsules_or_nan(right, PAIR["right"]), skin, between, np.zeros((FRAMES, 778, 3)))
         depths_mm.append(-1000 * between[HELD].min(axis=1).mean())
     assert depths_mm[0] < depths_mm[1] - 1
 
@@ -352,20 +357,20 @@ def test_contact_normals_are_unit_vectors_and_the_centre_of_a_slab_has_no_contac
         object_track = ObjectTrack(slab, np.zeros_like(position_m), position_m)
         clip = clip_of("toy/s1/i", object_track, {"left": replace(hand, wrist_m=hand.wrist_m + 1), "right": hand})
         load = _Load.of(clip, 4)
-        contacts = load._contacts(capsules_there(hand.take(load.frames), PAIR["right"]))
+        contacts = load._contacts(capsules_or_nan(hand.take(load.frames), PAIR["right"]))
         assert len(contacts.frame)
         np.testing.assert_allclose(np.linalg.norm(contacts.normal, axis=1), 1, atol=1e-9)
-        assert np.isfinite(load.carried([capsules_there(hand.take(load.frames), PAIR["right"])]))
+        assert np.isfinite(load.carried([capsules_or_nan(hand.take(load.frames), PAIR["right"])]))
         without_gradient = replace(load, field=ZeroGradientField())
-        assert not len(without_gradient._contacts(capsules_there(hand.take(load.frames), PAIR["right"])).frame)
+        assert not len(without_gradient._contacts(capsules_or_nan(hand.take(load.frames), PAIR["right"])).frame)
 
 
 def test_a_hand_with_a_shape_per_frame_is_refined():
     clip = clip_of_box_at_rest()
     tracks = {side: replace(track, betas=np.repeat(track.betas, FRAMES, 0)) for side, track in clip.hands.items()}
-    assert carried_share(PAIR, replace(clip, hands=tracks)) == 1
-    refined = hold_hands(PAIR, replace(clip, hands=tracks), AS_GENERATED)
-    expected = hold_hands(PAIR, clip, AS_GENERATED)
+    assert carried_fraction(PAIR, replace(clip, hands=tracks)) == 1
+    refined = refined_tracks(PAIR, replace(clip, hands=tracks), AS_GENERATED)
+    expected = refined_tracks(PAIR, clip, AS_GENERATED)
     np.testing.assert_allclose(refined["right"].wrist_m, expected["right"].wrist_m, atol=1e-6)
 
 
@@ -387,7 +392,7 @@ def test_refinement_uses_one_blas_thread(pushed, monkeypatch):
 
     monkeypatch.setattr("hoidata.refinement.holding._starts", starts)
     with threadpool_limits(2, user_api="blas"):
-        hold_clip(PAIR, pushed[0])
+        refine_grasps(PAIR, pushed[0])
     assert set(threads) == {1}
 
 
@@ -400,8 +405,8 @@ def test_a_grasp_is_extended_in_the_first_attempt_only(pushed, monkeypatch):
 
     monkeypatch.setattr("hoidata.refinement.holding._solved", solved)
     monkeypatch.setattr("hoidata.refinement.holding._Load.carried", lambda self, hands: 0.0)
-    hold_hands(PAIR, clip, AS_GENERATED)
-    assert len(attempts) == len(HoldSettings().reach_m)
+    refined_tracks(PAIR, clip, AS_GENERATED)
+    assert len(attempts) == len(GraspSettings().reach_m)
     grasped_frames = [sum(stop - start for start, stop in grasps["left"]) for grasps in attempts[1:]]
     assert len(set(grasped_frames)) == 1
 
@@ -414,8 +419,8 @@ def test_invalid_frames_of_the_other_hand_have_no_effect(pushed):
         noise = np.random.default_rng(seed).normal(size=(FRAMES, 3)).astype(np.float32)
         wrist_m = np.where(is_absent[:, None], clip.hands["left"].wrist_m + 0.02 * noise, right.wrist_m)
         hands = {**clip.hands, "right": replace(right, wrist_m=wrist_m, valid=~is_absent)}
-        refined.append(hold_hands(PAIR, replace(clip, hands=hands), AS_GENERATED)["left"])
-        assert carried_share(PAIR, replace(clip, hands=hands)) <= 1
+        refined.append(refined_tracks(PAIR, replace(clip, hands=hands), AS_GENERATED)["left"])
+        assert carried_fraction(PAIR, replace(clip, hands=hands)) <= 1
     assert refined[0].wrist_m.tobytes() == refined[1].wrist_m.tobytes()
     assert refined[0].hand_pose.tobytes() == refined[1].hand_pose.tobytes()
 
@@ -428,7 +433,7 @@ def test_an_invalid_hand_carries_nothing():
     for wrist_m in (hand.wrist_m, np.full_like(hand.wrist_m, np.nan)):
         absent = replace(hand, wrist_m=wrist_m, valid=np.arange(FRAMES) < 3)
         clip = clip_of("toy/s1/g", object_track, {"left": replace(hand, valid=np.zeros(FRAMES, bool)), "right": absent})
-        assert carried_share(PAIR, clip) == 0
+        assert carried_fraction(PAIR, clip) == 0
 
 
 def test_a_flat_lid_has_no_weight_and_does_not_fail():
@@ -443,13 +448,13 @@ def test_a_flat_lid_has_no_weight_and_does_not_fail():
     scene = clip_scene(clip, PAIR)
     alone = clip_scene(replace(clip, object=ObjectTrack(base, object_track.rotvec, position_m)), PAIR)
     np.testing.assert_allclose(scene.wrench, alone.wrench, atol=1e-9)
-    assert 0 <= carried_share(PAIR, clip) <= 1
+    assert 0 <= carried_fraction(PAIR, clip) <= 1
 
 
 @pytest.mark.parametrize("settings", [{"reach_m": (0.003, 0.012)}, {"reach_m": (), "keypoint_m": ()}])
 def test_each_attempt_needs_a_reach_and_a_deviation(settings):
     with pytest.raises(BadInput, match="as many of each"):
-        HoldSettings(**settings)
+        GraspSettings(**settings)
 
 
 def test_the_other_part_passes_only_in_grasps_in_which_the_hinge_moves():
@@ -470,5 +475,5 @@ def test_a_correction_that_is_nan_is_rejected(pushed, monkeypatch):
     monkeypatch.setattr(
         "hoidata.refinement.banded.solve_damped", lambda blocks, vector, damping: np.full_like(vector, np.nan)
     )
-    for track in hold_hands(PAIR, pushed[0], AS_GENERATED).values():
+    for track in refined_tracks(PAIR, pushed[0], AS_GENERATED).values():
         assert all(np.isfinite(array).all() for array in (track.wrist_m, track.global_orient, track.hand_pose))

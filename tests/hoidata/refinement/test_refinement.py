@@ -12,7 +12,7 @@ from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
-from hoidata.refinement import GeneratedHand, RefinementSettings, fit_hands, refine_hands
+from hoidata.refinement import GeneratedKeypoints, RefinementSettings, fit_hands, refine_hands
 from hoidata.refinement.banded import solve_damped
 from hoidata.refinement.skin import HandPose
 from tests.builders.clips import still_object
@@ -29,7 +29,7 @@ def skin(side: Side, track: HandTrack) -> np.ndarray:
     return track_vertices(track, PAIR[side]).astype(np.float64)
 
 
-def touching(frames: int = FRAMES, seed: int = 0) -> dict[Side, GeneratedHand]:
+def touching(frames: int = FRAMES, seed: int = 0) -> dict[Side, GeneratedKeypoints]:
     """Both hands come from 8 cm above and sink 12 mm into the top of a box, one into each half."""
     hands, random = {}, np.random.default_rng(seed)
     for index, side in enumerate(SIDES):
@@ -43,7 +43,7 @@ def touching(frames: int = FRAMES, seed: int = 0) -> dict[Side, GeneratedHand]:
         keypoints = vertices_m[:, IDS] + random.normal(0, SHAKE_M, (frames, 1, 3))
         to_object = np.zeros_like(keypoints)
         to_object[..., 2] = 0.05 - keypoints[..., 2]
-        hands[side] = GeneratedHand(keypoints, to_object, valid)
+        hands[side] = GeneratedKeypoints(keypoints, to_object, valid)
     return hands
 
 
@@ -73,7 +73,7 @@ def test_a_motion_is_recovered_from_its_keypoints():
         pose = HandPose(random.normal(0, 1, (10, 3)), rotation, fingers + random.normal(0, 0.1, fingers.shape))
         truth[side] = pose.track(BETAS[index], np.ones(10, bool), None)
         keypoints = skin(side, truth[side])[:, IDS]
-        generated[side] = GeneratedHand(keypoints, np.zeros_like(keypoints), np.ones(10, bool))
+        generated[side] = GeneratedKeypoints(keypoints, np.zeros_like(keypoints), np.ones(10, bool))
     fitted = fit_hands(PAIR, BETAS, IDS, generated)
     for side in SIDES:
         error_m = np.linalg.norm(skin(side, fitted[side]) - skin(side, truth[side]), axis=-1)
@@ -160,7 +160,7 @@ def _quartered(model: ObjectModel) -> ObjectModel:
 @pytest.mark.slow
 def test_the_start_of_a_motion_does_not_depend_on_its_length(scene):
     longer = {
-        side: GeneratedHand(
+        side: GeneratedKeypoints(
             *(np.concatenate((a, a[-1:].repeat(40, axis=0))) for a in (h.keypoints_m, h.to_object_m, h.is_active))
         )
         for side, h in scene["generated"].items()
@@ -183,7 +183,7 @@ def test_refined_hands_move_with_the_world_frame(scene):
     object_track = ObjectTrack(BOX, rotvec, position_m)
     world = object_track.world_from_object
     carried = {
-        side: GeneratedHand(world @ h.keypoints_m, world.turn(h.to_object_m), h.is_active)
+        side: GeneratedKeypoints(world @ h.keypoints_m, world.turn(h.to_object_m), h.is_active)
         for side, h in scene["generated"].items()
     }
     tracks = refine_hands(PAIR, IDS, carried, fit_hands(PAIR, BETAS, IDS, carried), object_track)

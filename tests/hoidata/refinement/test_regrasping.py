@@ -10,10 +10,10 @@ from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
-from hoidata.refinement import HoldSettings, carried_share, hold_hands
+from hoidata.refinement import GraspSettings, carried_fraction, refined_tracks
 from hoidata.refinement.grasp_solver import SolverSettings
 from hoidata.refinement.object_field import ObjectField
-from hoidata.refinement.regrasping import Held, RegraspSettings, bends_rad, grasps_that_carry
+from hoidata.refinement.regrasping import GraspSearchSettings, Held, bends_rad, search_grasps
 from hoidata.refinement.skin import HandPose, SkinnedHand
 from tests.builders.clips import clip_of
 from tests.builders.objects import box_model
@@ -40,14 +40,14 @@ def deepest_mm(clip: Clip, track: HandTrack) -> np.ndarray:
 
 
 def carried(clip: Clip, track: HandTrack) -> float:
-    return carried_share(PAIR, replace(clip, hands={**clip.hands, "right": track}))
+    return carried_fraction(PAIR, replace(clip, hands={**clip.hands, "right": track}))
 
 
 @pytest.fixture(scope="module")
 def laid_on_top() -> tuple[Clip, HandTrack, HandTrack]:
     """The clip, the hand refined without the grasp search, and with it."""
     clip = lifted(np.zeros(3))
-    return clip, hold_hands(PAIR, clip, AS_GENERATED)["right"], hold_hands(PAIR, clip)["right"]
+    return clip, refined_tracks(PAIR, clip, AS_GENERATED)["right"], refined_tracks(PAIR, clip)["right"]
 
 
 def test_a_flat_hand_that_carries_nothing_grasps_from_two_sides_and_does_not_slide(laid_on_top):
@@ -70,7 +70,7 @@ def test_the_alternative_grasp_is_close_to_the_original(laid_on_top):
 
 def test_equal_input_gives_equal_bytes(laid_on_top):
     clip, _, after = laid_on_top
-    again = hold_hands(PAIR, clip)["right"]
+    again = refined_tracks(PAIR, clip)["right"]
     assert again.wrist_m.tobytes() == after.wrist_m.tobytes()
     assert again.hand_pose.tobytes() == after.hand_pose.tobytes()
 
@@ -79,7 +79,7 @@ def test_a_hand_that_carries_is_unchanged(laid_on_top):
     clip, _, after = laid_on_top
     carrying = replace(clip, hands={**clip.hands, "right": after})
     with_search, without_search = (
-        hold_hands(PAIR, carrying, settings)["right"] for settings in (HoldSettings(), AS_GENERATED)
+        refined_tracks(PAIR, carrying, settings)["right"] for settings in (GraspSettings(), AS_GENERATED)
     )
     assert with_search.wrist_m.tobytes() == without_search.wrist_m.tobytes()
     assert with_search.hand_pose.tobytes() == without_search.hand_pose.tobytes()
@@ -89,7 +89,7 @@ def test_an_alternative_grasp_is_above_the_table():
     """The cube is in the air at both ends of the clip and on the table in between."""
     rise_m = np.interp(np.arange(FRAMES), [8, 18, 26, 36], [0.15, 0, 0, 0.15])
     clip = lifted(np.array([1.2, 0, 0]), rise_m)
-    flat, after = (hold_hands(PAIR, clip, settings)["right"] for settings in (AS_GENERATED, HoldSettings()))
+    flat, after = (refined_tracks(PAIR, clip, settings)["right"] for settings in (AS_GENERATED, GraspSettings()))
     assert carried(clip, after) > carried(clip, flat)
     assert track_vertices(after, PAIR["right"])[18:27, :, 2].min() > -0.008
 
@@ -116,7 +116,7 @@ def one_after_the_other(first: Clip, second: Clip) -> Clip:
 @pytest.mark.parametrize("rotvec", [(0, 0, 0), (0, -1.2, 0)])
 def test_each_of_two_grasps_gets_an_alternative_that_carries(rotvec):
     clip = one_after_the_other(lifted(np.array(rotvec)), lifted(np.array([np.pi / 2, 0, 0])))
-    flat, regrasped = (hold_hands(PAIR, clip, settings)["right"] for settings in (AS_GENERATED, HoldSettings()))
+    flat, regrasped = (refined_tracks(PAIR, clip, settings)["right"] for settings in (AS_GENERATED, GraspSettings()))
     assert (carried(clip, flat), carried(clip, regrasped)) == (0, 1)
 
 
@@ -139,8 +139,8 @@ def held(model: ObjectModel) -> Held:
 @pytest.mark.parametrize(("height_m", "most_m"), [(0.06, 0.006), (0.008, 0.002)])
 def test_grasps_are_ordered_by_distance_and_none_is_deep_or_bent(height_m, most_m):
     """In a plate of 8 mm half of the usual depth is allowed."""
-    start, settings = held(box_model((0.06, 0.06, height_m))), RegraspSettings(tries=48)
-    grasps = list(grasps_that_carry(start, lambda _: True, SolverSettings(), settings))
+    start, settings = held(box_model((0.06, 0.06, height_m))), GraspSearchSettings(tries=48)
+    grasps = list(search_grasps(start, lambda _: True, SolverSettings(), settings))
     skin_m = [start.skin.vertices_m(start.skin.chain(pose)) for pose in (start.pose, *grasps)]
     change_m = [np.linalg.norm(points_of_grasp_m - skin_m[0], axis=-1).mean() for points_of_grasp_m in skin_m[1:]]
     assert 0 < len(grasps) < 48
@@ -148,4 +148,4 @@ def test_grasps_are_ordered_by_distance_and_none_is_deep_or_bent(height_m, most_
     for pose, points_m in zip(grasps, skin_m[1:], strict=True):
         assert start.field.distances(points_m, np.array([24]))[0].min() > -most_m - 5e-4
         assert np.linalg.norm(pose.fingers, axis=-1).max() < 1.9
-    assert not list(grasps_that_carry(start, lambda _: False, SolverSettings(), settings))
+    assert not list(search_grasps(start, lambda _: False, SolverSettings(), settings))

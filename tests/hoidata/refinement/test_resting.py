@@ -7,7 +7,7 @@ import pytest
 
 from hoidata.clips.clip import Clip, ObjectTrack
 from hoidata.hands import load_embedded_hands, track_joints
-from hoidata.refinement.resting import rest_object
+from hoidata.refinement.resting import snap_to_rest
 from tests.hoidata.refinement.test_holding import BOX, clip_of, pressed
 
 PAIR = load_embedded_hands()
@@ -34,7 +34,7 @@ def height(clip: Clip) -> np.ndarray:
 @pytest.mark.parametrize("end_m", [0.02, -0.02])
 def test_an_object_put_down_too_high_or_too_low_is_moved_to_its_first_height(end_m):
     clip = lifted(end_m)
-    rested = rest_object(clip)
+    rested = snap_to_rest(clip)
     assert np.abs(height(rested)[[0, 5, -5, -1]]).max() < 2e-4
     assert np.abs(height(rested) - height(clip)).max() == pytest.approx(0.02, abs=1e-3)
     step = np.diff(height(rested) - height(clip))
@@ -44,7 +44,7 @@ def test_an_object_put_down_too_high_or_too_low_is_moved_to_its_first_height(end
 
 def test_hands_move_with_the_object():
     clip = lifted(0.02)
-    rested = rest_object(clip)
+    rested = snap_to_rest(clip)
     for side in clip.hands:
         relative_m = [track_joints(c.hands[side], PAIR[side]) - c.object.translation_m[:, None] for c in (clip, rested)]
         np.testing.assert_allclose(relative_m[1], relative_m[0], atol=1e-6)
@@ -52,7 +52,7 @@ def test_hands_move_with_the_object():
 
 @pytest.mark.parametrize("clip", [lifted(0.0), lifted(0.1), lifted(-0.2)], ids=["same height", "shelf", "floor"])
 def test_an_object_put_down_on_another_surface_is_unchanged(clip):
-    np.testing.assert_allclose(height(rest_object(clip)), height(clip), atol=1e-6)
+    np.testing.assert_allclose(height(snap_to_rest(clip)), height(clip), atol=1e-6)
 
 
 @pytest.mark.parametrize("end_m", [0.1, -0.2])
@@ -61,7 +61,7 @@ def test_an_object_that_drifts_before_another_surface_does_not_jump(end_m, drift
     clip = lifted(end_m)
     drift = drift_m * np.clip(np.arange(FRAMES) / 8, 0, 1)
     clip = moved(clip, drift)
-    rested = rest_object(clip)
+    rested = snap_to_rest(clip)
     assert np.abs(height(rested)[:8]).max() < 1e-6
     assert np.abs(np.diff(height(rested) - height(clip))).max() < 0.001
     np.testing.assert_allclose(height(rested)[20:], height(clip)[20:], atol=1e-6)
@@ -69,7 +69,7 @@ def test_an_object_that_drifts_before_another_surface_does_not_jump(end_m, drift
 
 def test_a_slow_lift_is_not_removed():
     clip = moved(lifted(0.0, 0.0, away=0.0), np.linspace(0, 0.036, FRAMES))
-    rested = rest_object(clip)
+    rested = snap_to_rest(clip)
     assert height(rested)[-1] == pytest.approx(0.036, abs=1e-6)
     assert np.abs(np.diff(height(rested))).max() < 0.003
 
@@ -82,7 +82,7 @@ def moved(clip: Clip, up_m: np.ndarray) -> Clip:
 
 def test_an_object_does_not_pass_through_its_support():
     clip = lifted(0.01, middle_m=-0.05)
-    rested = rest_object(clip)
+    rested = snap_to_rest(clip)
     assert height(clip).min() < -0.03
     assert height(rested).min() > -1e-6
     assert height(rested).max() < 2e-3  # it slides; only the 10 mm of the end are distributed
@@ -93,15 +93,15 @@ def test_an_object_does_not_pass_through_its_support():
 @pytest.mark.parametrize("end_m", [0.0, 0.02, -0.02])
 def test_an_object_in_the_air_at_both_ends_is_unchanged(end_m):
     clip = lifted(end_m, middle_m=-0.15)
-    np.testing.assert_array_equal(height(rest_object(clip)), height(clip))
+    np.testing.assert_array_equal(height(snap_to_rest(clip)), height(clip))
 
 
 def test_a_clip_without_gravity_or_without_rest_at_its_start_is_unchanged():
     clip = lifted(0.02)
     for other in (replace(clip, gravity=None), lifted(0.02, start=-6)):
-        assert rest_object(other) is other
+        assert snap_to_rest(other) is other
 
 
 def test_a_second_run_changes_nothing():
-    rested = rest_object(lifted(0.02, middle_m=-0.05))
-    np.testing.assert_allclose(height(rest_object(rested)), height(rested), atol=1e-3)
+    rested = snap_to_rest(lifted(0.02, middle_m=-0.05))
+    np.testing.assert_allclose(height(snap_to_rest(rested)), height(rested), atol=1e-3)

@@ -274,7 +274,7 @@ def test_an_open_box_has_no_inside_and_is_hit_from_both_sides_and_a_small_hole_i
     assert (readings.distance_m >= 0).all()
     ball = trimesh.creation.icosphere(3, 0.04)
     holed = SurfaceIndex(model_of(trimesh.Trimesh(ball.vertices, ball.faces[1:])))
-    assert holed.solid_note == "object: 1 small hole closed"
+    assert holed.repair_note == "object: 1 small hole closed"
     whole = sense(hand, state, HERE, None, SurfaceIndex(model_of(ball)))
     assert_equal_readings(sense(hand, state, HERE, None, holed), whole)
     assert whole.distance_m.min() < 0

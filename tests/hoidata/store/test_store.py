@@ -20,7 +20,7 @@ from hoidata.contact.settings import read_contact_settings
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.arrays import write_npz
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
-from hoidata.quality.thresholds import left_out_reasons
+from hoidata.quality.thresholds import exclusion_reasons
 from hoidata.store.annotated import load_annotated
 from hoidata.store.distances import DistanceEntries
 from hoidata.store.info import generated_info
@@ -364,7 +364,7 @@ def dataset(tmp_path: Path) -> Path:
 
 READERS: list[Callable[[Path], object]] = [
     load_annotated,
-    lambda root: left_out_reasons(root / "quality"),
+    lambda root: exclusion_reasons(root / "quality"),
     lambda root: read_contact_settings(root / "contact"),
 ]
 

@@ -10,7 +10,7 @@ from hoidata.clips import SIDES, Clip, ObjectTrack
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.sampling import sample_points
 from hoidata.surface.bimart_maps import BEYOND, REACH_M, STEP_M, bimart_map, packed_map
-from hoidata.surface.contact import PlacedHand, placed_hand
+from hoidata.surface.contact import HandInObjectFrame, hand_in_object_frame
 from tests.builders.clips import MIRROR, in_another_world, mirror_image, with_object
 
 POINTS = 200
@@ -28,11 +28,11 @@ def scene(request, make_clip):
     return clip, vertices, sample_points(clip.object.model, POINTS)
 
 
-def placed(track: ObjectTrack, vertices: np.ndarray, valid: np.ndarray | None = None) -> PlacedHand:
+def placed(track: ObjectTrack, vertices: np.ndarray, valid: np.ndarray | None = None) -> HandInObjectFrame:
     """World vertices as the object sees them."""
     frames = np.arange(len(vertices)) if valid is None else np.flatnonzero(valid)
     hinge = None if track.hinge_rad is None else track.hinge_rad[frames]
-    return PlacedHand(
+    return HandInObjectFrame(
         vertices_m=(track.world_from_object.inverse() @ vertices.astype(np.float64))[frames],
         frames=frames,
         hinge_rad=hinge,
@@ -86,7 +86,7 @@ def test_map_is_the_distance_to_the_nearest_hand_vertex(scene):
         truth = brute_force(clip.object, vertices[side], points)
         assert np.isfinite(truth).sum() > POINTS
         np.testing.assert_allclose(map_of(clip.object, vertices[side], points), truth, atol=1e-6)
-        hand = placed_hand(clip, side, load_embedded_hands())
+        hand = hand_in_object_frame(clip, side, load_embedded_hands())
         np.testing.assert_allclose(bimart_map(hand, points, clip.object.model), truth, atol=1e-6)
 
 

@@ -11,7 +11,7 @@ from hoidata.hands import load_embedded_hands, track_joints, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import sample_points
 from hoidata.surface.bimart_maps import bimart_map
-from hoidata.surface.contact import placed_hand
+from hoidata.surface.contact import hand_in_object_frame
 from hoidata.surface.measure import measure_hand
 from tests.builders.clips import with_object
 
@@ -81,7 +81,7 @@ def test_a_hand_that_is_never_valid_touches_nothing(through):
 
 def test_map_is_bimarts(through):
     points = sample_points(through.object.model, POINTS)
-    expected = bimart_map(placed_hand(through, "right", load_embedded_hands()), points, through.object.model)
+    expected = bimart_map(hand_in_object_frame(through, "right", load_embedded_hands()), points, through.object.model)
     assert np.isfinite(expected).any()
     np.testing.assert_array_equal(measured(through, "right").map_m, expected)
 

@@ -12,23 +12,23 @@ from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import SurfaceIndex
-from hoidata.surface.contact import PlacedHand, deepest_m, placed_hand, touched_vertices
+from hoidata.surface.contact import HandInObjectFrame, deepest_m, hand_in_object_frame, touched_vertices
 from hoidata.surface.solid_overlap import SolidOverlap
 from tests.builders.clips import in_another_world, mirror_image, with_hand, with_object
 
 HANDS = load_embedded_hands()
 
 
-def signed_distances_m(hand: PlacedHand, index: SurfaceIndex, most_m: float) -> np.ndarray:
+def signed_distances_m(hand: HandInObjectFrame, index: SurfaceIndex, most_m: float) -> np.ndarray:
     """(frame, 778) distance of each vertex, negative inside at any depth, infinite beyond ``most_m`` outside."""
     depth = index.depth_m(hand.vertices_m, hand.hinge_rad)
     distance = index.distance_m(hand.vertices_m, hand.hinge_rad, most_m)
-    return hand.over_clip(np.where(depth > 0, -depth, distance), np.nan)
+    return hand.expand_to_clip(np.where(depth > 0, -depth, distance), np.nan)
 
 
-def shared_m3(hand: PlacedHand, overlap: SolidOverlap) -> np.ndarray:
+def shared_m3(hand: HandInObjectFrame, overlap: SolidOverlap) -> np.ndarray:
     """(frame,) volume that hand and object both fill, NaN without the hand."""
-    return hand.over_clip(overlap.volume_m3(hand.vertices_m, hand.faces, hand.hinge_rad), np.nan)
+    return hand.expand_to_clip(overlap.volume_m3(hand.vertices_m, hand.faces, hand.hinge_rad), np.nan)
 
 
 def shifted(clip: Clip, way_m: float) -> Clip:
@@ -45,7 +45,7 @@ def test_distances_equal_libigl_s_to_the_posed_mesh_in_the_world(
 ) -> None:
     clip = shifted(make_clip(n_frames=5, articulated=articulated), 0.02)
     model, track = clip.object.model, clip.object
-    index, hand = SurfaceIndex(model), placed_hand(clip, "right", HANDS)
+    index, hand = SurfaceIndex(model), hand_in_object_frame(clip, "right", HANDS)
     posed = track.points_in_world(model.vertices_m, model.part)
     vertices = track_vertices(clip.hands["right"], HANDS.right).astype(np.float64)
     distances_m, touched = signed_distances_m(hand, index, 0.05), touched_vertices(hand, index)
@@ -64,7 +64,7 @@ def test_distances_equal_libigl_s_to_the_posed_mesh_in_the_world(
 
 def test_a_vertex_inside_has_its_depth_however_deep_and_one_outside_only_within_the_reach(make_clip) -> None:
     clip = shifted(make_clip(n_frames=2), 0.04)
-    index, hand = SurfaceIndex(clip.object.model), placed_hand(clip, "right", HANDS)
+    index, hand = SurfaceIndex(clip.object.model), hand_in_object_frame(clip, "right", HANDS)
     whole, near = signed_distances_m(hand, index, 1.0), signed_distances_m(hand, index, 0.001)
     assert whole.min() < -0.005
     assert (whole > 0.001).any()
@@ -75,13 +75,13 @@ def test_frames_without_the_hand_are_not_looked_at(make_clip: Callable[..., Clip
     clip = shifted(make_clip(n_frames=6), 0.02)
     valid = np.array([False, True, True, False, True, True])
     clip = with_hand(clip, valid=valid)
-    index, hand = SurfaceIndex(clip.object.model), placed_hand(clip, "right", HANDS)
+    index, hand = SurfaceIndex(clip.object.model), hand_in_object_frame(clip, "right", HANDS)
     touched, overlap = touched_vertices(hand, index), SolidOverlap(index, 0.002)
     np.testing.assert_array_equal(touched.any(axis=1), valid)
     np.testing.assert_array_equal(np.isfinite(deepest_m(hand, index)), valid)
     np.testing.assert_array_equal(np.isfinite(shared_m3(hand, overlap)), valid)
     gone = with_hand(clip, valid=np.zeros(6, bool))
-    assert np.isnan(deepest_m(placed_hand(gone, "right", HANDS), index)).all()
+    assert np.isnan(deepest_m(hand_in_object_frame(gone, "right", HANDS), index)).all()
 
 
 def test_each_valid_frame_uses_its_hinge_angle(
@@ -93,7 +93,7 @@ def test_each_valid_frame_uses_its_hinge_angle(
     with_gaps = with_hand(clip, valid=valid)
     index = SurfaceIndex(clip.object.model)
     overlap = SolidOverlap(index, 0.002)
-    whole, part = (placed_hand(each, "right", HANDS) for each in (clip, with_gaps))
+    whole, part = (hand_in_object_frame(each, "right", HANDS) for each in (clip, with_gaps))
     np.testing.assert_array_equal(
         signed_distances_m(part, index, 1.0)[valid], signed_distances_m(whole, index, 1.0)[valid]
     )
@@ -106,13 +106,13 @@ def test_deeper_hands_share_more_volume_and_a_far_hand_none(make_clip: Callable[
     index = SurfaceIndex(clip.object.model)
     overlap, volumes, depths = SolidOverlap(index), [], []
     for way_m in (0.0, 0.01, 0.02, 0.04):
-        hand = placed_hand(shifted(clip, way_m), "right", HANDS)
+        hand = hand_in_object_frame(shifted(clip, way_m), "right", HANDS)
         volumes.append(shared_m3(hand, overlap).mean())
         depths.append(deepest_m(hand, index).mean())
     assert (np.diff(volumes[1:]) > 0).all()
     assert (np.diff(depths[1:]) > 0).all()
-    assert not shared_m3(placed_hand(clip, "left", HANDS), overlap).any()
-    assert not deepest_m(placed_hand(clip, "left", HANDS), index).any()
+    assert not shared_m3(hand_in_object_frame(clip, "left", HANDS), overlap).any()
+    assert not deepest_m(hand_in_object_frame(clip, "left", HANDS), index).any()
 
 
 @pytest.mark.parametrize("articulated", [False, True], ids=["rigid", "articulated"])
@@ -122,7 +122,7 @@ def test_results_do_not_depend_on_the_world_frame(make_clip: Callable[..., Clip]
     index = SurfaceIndex(clip.object.model)
     overlap = SolidOverlap(index)
     for side in SIDES:
-        one, two = placed_hand(clip, side, HANDS), placed_hand(moved, side, HANDS)
+        one, two = hand_in_object_frame(clip, side, HANDS), hand_in_object_frame(moved, side, HANDS)
         np.testing.assert_allclose(two.vertices_m, one.vertices_m, atol=2e-6)
         first, second = signed_distances_m(one, index, 0.05), signed_distances_m(two, index, 0.05)
         clear = np.abs(np.abs(first) - 0.005) > 3e-6
@@ -139,7 +139,7 @@ def test_the_mirrored_clip_has_the_other_hand_s_contacts(make_clip: Callable[...
     index, other = SurfaceIndex(clip.object.model), SurfaceIndex(mirrored.object.model)
     overlaps = SolidOverlap(index, 0.0005), SolidOverlap(other, 0.0005)
     for side, opposite in zip(SIDES, reversed(SIDES), strict=True):
-        one, two = placed_hand(clip, side, HANDS), placed_hand(mirrored, opposite, HANDS)
+        one, two = hand_in_object_frame(clip, side, HANDS), hand_in_object_frame(mirrored, opposite, HANDS)
         first, second = signed_distances_m(one, index, 0.05), signed_distances_m(two, other, 0.05)
         both = np.isfinite(first) & np.isfinite(second)
         np.testing.assert_allclose(second[both], first[both], atol=3e-6)
@@ -153,9 +153,9 @@ def test_an_open_object_has_touched_vertices_but_no_penetration(make_clip: Calla
     clip = make_clip(n_frames=2)
     model = clip.object.model
     sheet = ObjectModel("sheet", model.vertices_m, model.faces[: len(model.faces) // 2], model.part)
-    index, hand = SurfaceIndex(sheet), placed_hand(clip, "right", HANDS)
-    assert isinstance(hand, PlacedHand)
+    index, hand = SurfaceIndex(sheet), hand_in_object_frame(clip, "right", HANDS)
+    assert isinstance(hand, HandInObjectFrame)
     assert touched_vertices(hand, index, 1.0).all()
     with pytest.raises(BadInput, match="it is open"):
         deepest_m(hand, index)
-    assert index.solid_note == "sheet has no inside: it is open"
+    assert index.repair_note == "sheet has no inside: it is open"

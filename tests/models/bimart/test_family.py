@@ -15,14 +15,14 @@ from hoidata.hands import load_embedded_hands
 from hoidata.sensors.keypoints import hand_keypoints
 from hoidata.sensors.part_bps import BasisSettings, distance_map
 from hoidata.store.annotated import AnnotatedStore
-from models.bimart.family import BIMART, OTHER_OBJECT, OTHER_PATH, UNREFINED, ZERO_MAP, HandsForPaths
+from models.bimart.family import BIMART, OTHER_OBJECT, OTHER_PATH, UNREFINED, ZERO_MAP, BimArtSampler
 from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel
 from models.bimart.retrieval import NEAREST_REFINED, NEAREST_WINDOW, OBJECT_MEAN_POSE
 from models.bimart.sampler import BimArt, SamplingTask
 from models.bimart.scene import FeatureConfig, Scene, recorded_clip
 from models.bimart.training import CONTACT, MOTION, LossConfig, learn_statistics, targets_of, window_losses
 from models.common.checkpoints import load_checkpoint
-from models.common.family import LeftOut, Network, Setup, Sources
+from models.common.family import Network, Setup, Skipped, Sources
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.training import train_network
 from models.common.transformer import TransformerConfig
@@ -157,7 +157,7 @@ def test_a_request_without_object_motion_is_skipped_with_the_reason(
 ) -> None:
     requests = requests_for(samples[1], PredictionConfig(samples=2))
     answers = UNREFINED.load(sources).sample([replace(requests[0], trajectories=None), requests[1]])
-    assert isinstance(answers[0], LeftOut)
+    assert isinstance(answers[0], Skipped)
     assert "motion of an object" in answers[0].reason
     assert isinstance(answers[1], Clip)
 
@@ -184,7 +184,7 @@ def test_networks_with_different_features_are_refused(sources: Sources, annotate
     )
     (tmp_path / CONTACT.name).symlink_to(sources.checkpoints / CONTACT.name)
     with pytest.raises(BadInput, match="features of its contact model"):
-        HandsForPaths.load(replace(sources, checkpoints=tmp_path))
+        BimArtSampler.load(replace(sources, checkpoints=tmp_path))
 
 
 def test_diagnosed_metrics_are_positive_and_the_best_of_ten_maps_is_no_worse_than_the_mean(sources: Sources) -> None:
@@ -218,7 +218,7 @@ def test_windows_with_an_untracked_hand_are_not_copied(family, sources: Sources,
     untracked = [replace(one, valid=one.valid & (np.arange(one.length) != 3)) for one in train]
     monkeypatch.setattr("models.bimart.retrieval.training_clips", lambda _: untracked)
     (answer,) = family.load(sources).sample(requests_for(train[0], PredictionConfig(samples=1)))
-    assert isinstance(answer, LeftOut)
+    assert isinstance(answer, Skipped)
 
 
 @pytest.mark.slow

@@ -15,8 +15,8 @@ from hoidata.object_paths import ObjectPath, keyframed_path, parse_keyframes
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.keypoints import hand_keypoints
 from hoidata.sensors.part_bps import BasisSettings
-from models.bimart.family import FamilyConfig, HandsForPaths
-from models.bimart.hands import MadeHands, MotionWish, hands_for
+from models.bimart.family import BimArtSampler, FamilyConfig
+from models.bimart.hands import HandSamplingOptions, SampledHands, hands_for
 from models.bimart.network import ContactModel, DenoiserConfig, MotionModel
 from models.bimart.sampler import OURS, BimArt
 from models.bimart.scene import FeatureConfig
@@ -39,7 +39,7 @@ TINY = DenoiserConfig(
 
 
 @pytest.fixture(scope="module")
-def sampler() -> HandsForPaths:
+def sampler() -> BimArtSampler:
     """Untrained networks whose output has the size of hands."""
     torch.manual_seed(0)
     contact, motion = ContactModel(TINY), MotionModel(TINY)
@@ -53,7 +53,7 @@ def sampler() -> HandsForPaths:
         contact.scale.fill_(0.005)
     sampling = replace(OURS, sampler=SamplerConfig("ddim", 2, 0.5))
     model = BimArt(contact.eval(), motion.eval(), sampling, torch.device("cpu"))
-    return HandsForPaths(model, PAIR, FamilyConfig(), synthetic=True)
+    return BimArtSampler(model, PAIR, FamilyConfig(), synthetic=True)
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +63,8 @@ def path() -> ObjectPath:
 
 
 @pytest.fixture(scope="module")
-def motions(sampler, path) -> list[MadeHands]:
-    return hands_for(sampler, path.track, MotionWish(seed=3, samples=2, words="box"))
+def motions(sampler, path) -> list[SampledHands]:
+    return hands_for(sampler, path.track, HandSamplingOptions(seed=3, samples=2, words="box"))
 
 
 def test_the_object_track_is_unchanged_and_both_hands_are_in_all_frames(motions, path):
@@ -77,7 +77,7 @@ def test_the_object_track_is_unchanged_and_both_hands_are_in_all_frames(motions,
 
 @pytest.mark.slow
 def test_a_sample_is_repeatable_and_does_not_depend_on_the_number_of_samples(sampler, path, motions):
-    alone = hands_for(sampler, path.track, MotionWish(seed=3))[0]
+    alone = hands_for(sampler, path.track, HandSamplingOptions(seed=3))[0]
     for side in SIDES:
         first, repeated, other = (motion.clip.hands[side] for motion in (motions[0], alone, motions[1]))
         assert all(np.array_equal(getattr(first, name), getattr(repeated, name)) for name in first.PER_FRAME)
@@ -86,7 +86,7 @@ def test_a_sample_is_repeatable_and_does_not_depend_on_the_number_of_samples(sam
 
 @pytest.mark.slow
 def test_only_the_requested_hand_is_sampled(sampler, path):
-    left = hands_for(sampler, path.track, MotionWish(hand="left"))[0]
+    left = hands_for(sampler, path.track, HandSamplingOptions(hand="left"))[0]
     assert left.clip.hands["left"].valid.all()
     assert not left.clip.hands["right"].valid.any()
     assert list(left.standing.touching) == ["left"]
@@ -108,7 +108,7 @@ def test_contact_measures_equal_those_of_the_hand_meshes(motions):
         distance = index.distance_m(vertices_object_m, object_track.hinge_rad).min(axis=1)
         assert np.array_equal(motion.standing.touching[side], distance < 0.005)
     assert np.isfinite(motion.asked_m).sum() > 20
-    assert motion.standing.deepest_m.max() < motion.standing_before.deepest_m.max()
+    assert motion.standing.deepest_m.max() < motion.unrefined_measures.deepest_m.max()
 
 
 def test_too_short_a_motion_is_bad_input(sampler, path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hoidata.clips.clip import HandTrack
-from models.manipnet.animate import clip_control, gap_of, straight_fingers, with_fingers
+from models.manipnet.animate import control_from_clip, gap_of, interpolate_fingers, with_fingers
 from tests.builders.clips import build_clip, random_hand, with_hand
 
 FRAMES = 40
@@ -39,7 +39,7 @@ def test_an_untracked_wrist_has_its_nearest_tracked_pose_and_a_tracked_wrist_is_
     tracked[10:20] = False
     clip = with_hand(build_clip(FRAMES), "right", **vars(partly_tracked_hand(tracked)))
     track, frames = clip.hands["right"], slice(5, 25)
-    filled = with_fingers(track, frames, np.tile(np.eye(3), (20, 15, 1, 1)), clip_control(clip).wrists["right"])
+    filled = with_fingers(track, frames, np.tile(np.eye(3), (20, 15, 1, 1)), control_from_clip(clip).wrists["right"])
     nearest = np.array([9] * 5 + [20] * 5)
     np.testing.assert_allclose(filled.wrist_m[10:20], track.wrist_m[nearest], atol=1e-6)
     np.testing.assert_array_equal(filled.wrist_m[tracked], track.wrist_m[tracked])
@@ -53,6 +53,6 @@ def test_a_gap_of_up_to_two_seconds_between_known_poses_is_short() -> None:
     assert gap_of(track, slice(5, 65)).is_short
     assert not gap_of(track, slice(5, 66)).is_short
     assert not gap_of(track, slice(0, 30)).is_short
-    assert len(straight_fingers(gap_of(track, slice(5, 65)))) == 60
+    assert len(interpolate_fingers(gap_of(track, slice(5, 65)))) == 60
     with pytest.raises(ValueError, match="both sides"):
-        straight_fingers(gap_of(track, slice(0, 30)))
+        interpolate_fingers(gap_of(track, slice(0, 30)))

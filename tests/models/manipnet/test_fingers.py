@@ -20,10 +20,10 @@ from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.mano_hand import mano_hand
 from hoidata.store.annotated import AnnotatedStore
 from models.common.checkpoints import load_checkpoint
-from models.common.family import LeftOut, Sources
+from models.common.family import Skipped, Sources
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.training import train_network
-from models.manipnet.animate import Gap, new_fingers
+from models.manipnet.animate import Gap, predict_fingers
 from models.manipnet.control import control_of, finger_rotmats_of, hands_of, trajectories_of
 from models.manipnet.family import FingerSampler
 from models.manipnet.features import FeatureSettings, outputs, pose_features
@@ -125,7 +125,7 @@ def test_a_request_without_trajectories_is_skipped_with_the_reason(
 ) -> None:
     request = replace(requests_for(samples[0], PredictionConfig(samples=1))[0], trajectories=None)
     (answer,) = fingers.sample([request])
-    assert isinstance(answer, LeftOut)
+    assert isinstance(answer, Skipped)
     assert "trajectories" in answer.reason
 
 
@@ -337,7 +337,7 @@ def test_new_fingers_depend_on_the_poses_before_and_after_the_gap(
     )
     recorded = finger_rotmats_of(sample.hands[1])
     gap = Gap(frames.start, frames.stop, recorded[8], recorded[20])
-    predicted = new_fingers(fingers.predictor, hand, "right", control, gap)
+    predicted = predict_fingers(fingers.predictor, hand, "right", control, gap)
     other_gap = gap._replace(after=hand.rest_rotmats @ rotvec_to_rotmat(np.full((15, 3), 0.2)))
-    assert np.abs(predicted - new_fingers(fingers.predictor, hand, "right", control, other_gap)).max() > 0.05
+    assert np.abs(predicted - predict_fingers(fingers.predictor, hand, "right", control, other_gap)).max() > 0.05
     assert len(predicted) == 11

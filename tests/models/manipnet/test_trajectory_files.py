@@ -13,7 +13,7 @@ from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.user_mesh import UNITS_M
 from hoidata.sensors.mano_hand import mano_hand
-from models.manipnet.animate import at_30_fps, blend_ends, given_control, interpolated
+from models.manipnet.animate import at_30_fps, blend_ends, control_from_file, interpolated
 from models.manipnet.control import Control, Motion
 from models.manipnet.plausible import reading
 from models.manipnet.trajectory_files import PARTS, Axes, parse_csv, parse_manipnet, read_trajectories
@@ -77,7 +77,7 @@ def trajectory_tables() -> list[bytes]:
 
 
 def checked_control(text: str, model=BOX, unit: str = "m", axes: Axes = "model"):
-    return given_control(replace(parse_csv(text.encode(), "mine.csv", unit), axes=axes), model, HANDS)
+    return control_from_file(replace(parse_csv(text.encode(), "mine.csv", unit), axes=axes), model, HANDS)
 
 
 def with_last_time(time_s: str) -> str:

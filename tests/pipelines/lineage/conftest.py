@@ -16,7 +16,7 @@ from safetensors.numpy import save
 
 from hoidata.clips.clip import SourceFile
 from hoidata.files import canonical_json, sha256_bytes
-from hoidata.files.sealed import OPEN_SEAL, sealed
+from hoidata.files.checksums import EMPTY_CHECKSUMS, sealed
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from pipelines.lineage.graph import Stage, look_up, written_graph
@@ -124,7 +124,7 @@ def train(root: Path, weights: float = 0.0, **facts: object) -> None:
         stage = f"models/text2hoi/dvc.yaml:train@embedded-grab-{model}"
         provenance = build_provenance(root, stage, facts_of_stage | {"synthetic": True, "device": "cpu"} | facts)
         values = {"weight": np.full(4, weights, np.float32)}
-        data = sealed(save(values, {"hoidata": canonical_json({"provenance": provenance, "seal": OPEN_SEAL})}))
+        data = sealed(save(values, {"hoidata": canonical_json({"provenance": provenance, "seal": EMPTY_CHECKSUMS})}))
         path = root / f"checkpoints/embedded/grab/{model}/model.safetensors"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)

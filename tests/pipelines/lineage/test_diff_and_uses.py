@@ -13,7 +13,7 @@ from safetensors.numpy import save_file
 from hoidata.clips.clip import SourceFile
 from hoidata.errors import BadInput
 from hoidata.files.atomic import canonical_json
-from hoidata.files.sealed import read_metadata
+from hoidata.files.checksums import read_metadata
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from pipelines.lineage import provenance

@@ -10,7 +10,7 @@ import yaml
 
 from hoidata.errors import BadInput
 from hoidata.files.atomic import canonical_json, sha256_file
-from hoidata.files.sealed import payload_digest
+from hoidata.files.checksums import payload_digest
 from pipelines.lineage.check import check
 from pipelines.lineage.locks import dvc_digest
 from pipelines.lineage.raw import raw_sources

@@ -23,7 +23,7 @@ from pipelines.pages.dataset_page import (
 )
 from pipelines.pages.player import view_of
 from pipelines.pages.report import ReportFolders, write_report
-from pipelines.showing import closest_ids, find_clip, write_shown
+from pipelines.show_pages import closest_ids, dataset_of_clip, write_named_page
 from tests.builders.stores import write_annotated, write_clips
 
 SPLIT = {"by": "subject", "train": "rest", "test": ["s2"], "promises": ["subject"]}
@@ -192,30 +192,30 @@ def test_report_links_the_page_of_each_dataset_that_has_what_it_needs(project, h
 
 
 def test_show_writes_the_page_of_a_clip(project, tmp_path):
-    path = write_shown("grab/s2/lid_1", "embedded", tmp_path / "pages")
+    path = write_named_page("grab/s2/lid_1", "embedded", tmp_path / "pages")
     assert path == tmp_path / "pages" / "grab_s2_lid_1.html"
     assert '<p class="quiet">grab/s2/lid_1</p>' in path.read_text()
-    assert find_clip("grab/s1/box_2", "embedded", ["h2o", "grab"]).dataset == "grab"
+    assert dataset_of_clip("grab/s1/box_2", "embedded", ["h2o", "grab"]).dataset == "grab"
 
 
 def test_unknown_clip_names_the_closest_ones(project, tmp_path):
     with pytest.raises(BadInput, match=r"grab 4\).*got grab/s2/lid_2; closest: grab/s2/lid_1"):
-        write_shown("grab/s2/lid_2", "embedded", tmp_path)
+        write_named_page("grab/s2/lid_2", "embedded", tmp_path)
     with pytest.raises(BadInput, match="closest: grab/s1/box_far"):
-        write_shown("far", "embedded", tmp_path)
+        write_named_page("far", "embedded", tmp_path)
     assert closest_ids("FAR", ["s/box", "s/afar", "s/far"])[:2] == ["s/afar", "s/far"]
 
 
 def test_a_skipped_sequence_is_named_with_its_reason(project, tmp_path):
     with pytest.raises(BadInput, match=r"skipped in conversion: s1/mug_1\.npz: expected finite numbers, got NaN"):
-        write_shown("grab/s1/mug_1", "embedded", tmp_path)
+        write_named_page("grab/s1/mug_1", "embedded", tmp_path)
 
 
 def test_a_missing_stage_is_named(project, tmp_path):
     with pytest.raises(MissingResource, match="h2o has no clips to show: it was not converted"):
-        write_shown("h2o", "embedded", tmp_path)
+        write_named_page("h2o", "embedded", tmp_path)
     with pytest.raises(MissingResource, match="no dataset of the profile own is converted"):
-        write_shown("grab/s1/box_1", "own", tmp_path)
+        write_named_page("grab/s1/box_1", "own", tmp_path)
     (project / "contact").rename(project / "elsewhere")
     with pytest.raises(MissingResource, match="run the stage 'contact'"):
-        write_shown("grab/s1/box_1", "embedded", tmp_path)
+        write_named_page("grab/s1/box_1", "embedded", tmp_path)

@@ -7,7 +7,7 @@ import pytest
 from hoidata.errors import BadInput
 from hoidata.store.annotated import load_annotated
 from pipelines.pages.sequence_page import write_sequence_page
-from pipelines.showing import write_shown_of
+from pipelines.show_pages import write_page_from
 from tests.builders.stores import write_annotated
 
 SPLIT = {"by": "subject", "train": "rest", "validation": [], "test": ["s9"]}
@@ -41,8 +41,8 @@ def test_clips_are_listed_in_the_order_of_their_frames(dataset, hands, tmp_path)
 
 
 def test_show_writes_the_page_of_a_sequence_for_its_name(dataset, hands, tmp_path):
-    path = write_shown_of(dataset, "grab/s1/long", hands, tmp_path / "pages")
+    path = write_page_from(dataset, "grab/s1/long", hands, tmp_path / "pages")
     assert path == tmp_path / "pages" / "grab_s1_long.html"
     assert "The clips cut from this sequence" in path.read_text()
     with pytest.raises(BadInput, match="got grab/s1/short"):
-        write_shown_of(dataset, "grab/s1/short", hands, tmp_path)
+        write_page_from(dataset, "grab/s1/short", hands, tmp_path)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.annotation.sentences import four_sentences
+from hoidata.annotation.sentences import english_sentences
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.clips.quarantine import Quarantined
 from hoidata.clips.validation import check_clip
@@ -113,7 +113,7 @@ def test_its_words_make_sentences():
     verbs = {action[0] for action in EVENTS.values() if action is not None}
     assert {"pick up", "open", "cut", "turn on"} <= verbs
     for verb in verbs:
-        assert verb.split()[0] in four_sentences(verb, "trash can", "right")[0].lower()
+        assert verb.split()[0] in english_sentences(verb, "trash can", "right")[0].lower()
 
 
 def test_interpolated_frames_are_between_recorded_ones_and_metrics_skip_them(root):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hoidata.annotation.sentences import four_sentences
+from hoidata.annotation.sentences import english_sentences
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.clips.validation import check_clip
 from hoidata.conformance.check import check_adapter
@@ -84,7 +84,7 @@ def test_a_clip_has_words_of_its_object_and_no_verb(root: Path) -> None:
     clip = only_clip(root)
     assert clip.clip_id == f"hot3d/{ARIA}/00000-00035-mug_white"
     assert (clip.verb, clip.object_words, clip.subject) == (None, "white mug", "P0001")
-    assert four_sentences(clip.verb, clip.object_words, "both")[0] == "Move a white mug with both hands."
+    assert english_sentences(clip.verb, clip.object_words, "both")[0] == "Move a white mug with both hands."
     assert [track.model.name for track in clip.other_objects] == ["keyboard"]
     assert [str(key) for key in Hot3dAdapter().sequences(root)] == [f"hot3d/{ARIA}", f"hot3d/{QUEST}"]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.annotation.sentences import four_sentences
+from hoidata.annotation.sentences import english_sentences
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.clips.quarantine import Quarantined
 from hoidata.clips.validation import check_clip
@@ -235,7 +235,7 @@ def test_a_json_file_of_another_form_is_refused(read, data, says):
 @pytest.mark.slow
 def test_its_words_make_sentences():
     for verb in _VERBS.values():
-        assert verb.split()[0] in four_sentences(verb, "alcohol burner", "right")[0].lower()
+        assert verb.split()[0] in english_sentences(verb, "alcohol burner", "right")[0].lower()
 
 
 def test_a_tree_of_parts_as_deep_as_its_file_allows_is_read_in_less_than_two_seconds():

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from hoidata.annotation.sentences import four_sentences
+from hoidata.annotation.sentences import english_sentences
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.clips.validation import check_clip
 from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets import Quarantined, RawTree
 from hoidata.datasets.taco.adapter import TacoAdapter, frames_by_side, triplet
-from hoidata.errors import BadInput, ChangedMeanwhile
+from hoidata.errors import BadInput, RawFileChanged
 from hoidata.store.store import open_store
 from tests.builders.taco import HANDS, KEY, N_FRAMES, NAMES, dump, write_taco
 
@@ -56,7 +56,7 @@ def test_a_recording_becomes_one_clip_with_words_from_its_triplet(root: Path) ->
 
 def test_its_words_make_sentences() -> None:
     verb, noun, _ = triplet(NAMES[1])
-    assert four_sentences(verb, noun, "right")[0] == "Put in a spoon with the right hand."
+    assert english_sentences(verb, noun, "right")[0] == "Put in a spoon with the right hand."
 
 
 def test_a_clip_names_its_eight_source_files(root: Path) -> None:
@@ -86,7 +86,7 @@ def test_a_shape_file_that_the_manifest_lists_and_that_is_gone_is_an_error(root:
     raw = RawTree(root)
     TacoAdapter().load(raw, KEY, HANDS)
     hand_file(root, "left").with_name("left_hand_shape.pkl").unlink()
-    with pytest.raises(ChangedMeanwhile, match=r"left_hand_shape\.pkl"):
+    with pytest.raises(RawFileChanged, match=r"left_hand_shape\.pkl"):
         TacoAdapter().load(RawTree(root, {source.path: source for source in raw.sources}), KEY, HANDS)
 
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from hoidata.errors import BadInput
 from hoidata.files.atomic import exclusive
-from pipelines.side_by_side import (
+from pipelines.parallel_repro import (
     CODE,
     RUN,
     RWLOCK,
@@ -24,7 +24,7 @@ from pipelines.side_by_side import (
     describe_run,
     forget_broken_lock,
     log_of,
-    reproduce_side_by_side,
+    reproduce_in_parallel,
     run_all,
     stale_stages,
 )
@@ -110,9 +110,9 @@ import signal
 with open("imported", "a") as stream:
     stream.write("x")
 if __name__ == "__main__":
-    from pipelines.side_by_side import reproduce_side_by_side
+    from pipelines.parallel_repro import reproduce_in_parallel
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    reproduce_side_by_side([], 2)
+    reproduce_in_parallel([], 2)
 """
 
 
@@ -141,36 +141,36 @@ def tiny_project(folder: Path, sleep: float = 0.0) -> Path:
 @pytest.mark.slow
 def test_a_run_equals_dvc_repro_and_a_second_run_does_nothing(tmp_path):
     tiny_project(tmp_path)
-    run = reproduce_side_by_side([], jobs=2)
+    run = reproduce_in_parallel([], jobs=2)
     assert sorted(run.seconds) == sorted([CODE, *GRAPH])
     assert (tmp_path / "d.out").read_text() == "(d (b (a)) (c (a)))"
     assert "made d.out" in log_of("d").read_text()
     status = subprocess.run([sys.executable, "-m", "dvc", "repro"], capture_output=True, text=True)
     assert "Running stage 'd'" not in status.stdout
-    assert list(reproduce_side_by_side([], jobs=2).seconds) == [CODE]
+    assert list(reproduce_in_parallel([], jobs=2).seconds) == [CODE]
     with pytest.raises(BadInput, match="'x' not found"):
-        reproduce_side_by_side(["x"], jobs=2)
+        reproduce_in_parallel(["x"], jobs=2)
     (tmp_path / "b.src").write_text("B")
     assert stale_stages([]) == {"b": frozenset(), "d": frozenset("b")}
     assert stale_stages(["c"]) == {}
-    assert sorted(reproduce_side_by_side(["d"], jobs=1).seconds) == ["b", "d", CODE]
-    assert sorted(reproduce_side_by_side(["b"], jobs=1, force=True).seconds) == ["b", CODE]
+    assert sorted(reproduce_in_parallel(["d"], jobs=1).seconds) == ["b", "d", CODE]
+    assert sorted(reproduce_in_parallel(["b"], jobs=1, force=True).seconds) == ["b", CODE]
     assert "made b.out" in log_of("b").read_text()
 
 
 @pytest.mark.slow
 def test_a_failure_is_reported_with_its_output_and_existing_outputs_stay(tmp_path, capfd):
     tiny_project(tmp_path)
-    reproduce_side_by_side([], jobs=2)
+    reproduce_in_parallel([], jobs=2)
     (tmp_path / "b.src").write_bytes(b"\xff\xfe")
     (tmp_path / "e.src").write_text("E")
-    run = reproduce_side_by_side([], jobs=2)
+    run = reproduce_in_parallel([], jobs=2)
     assert set(run.failed) == {"b"}
     assert (tmp_path / "b.out").read_text() == "(b (a))"
     assert (tmp_path / "e.out").read_text() == "(E)"
     assert "UnicodeDecodeError" in capfd.readouterr().err
     (tmp_path / "code.txt").unlink()
-    assert reproduce_side_by_side([], jobs=2).failed == {CODE: 255}
+    assert reproduce_in_parallel([], jobs=2).failed == {CODE: 255}
     assert "code.txt" in capfd.readouterr().err
 
 
@@ -191,14 +191,14 @@ def test_stopping_a_run_stops_its_stages_and_the_next_run_completes(tmp_path, se
     while not log_of("a").is_file() or "make.py" not in log_of("a").read_text():
         time.sleep(0.1)
     with pytest.raises(BadInput, match="at work on it"):
-        reproduce_side_by_side([], jobs=1)
+        reproduce_in_parallel([], jobs=1)
     process.send_signal(sent)
     assert process.wait(timeout=15) != 0
     with exclusive(RUN, wait_s=0):
         assert not (tmp_path / "a.out").exists()
     assert (tmp_path / "imported").read_text() == "x", "a stage imports what the run was started with, as Prefect"
     (tmp_path / "make.py").write_text((tmp_path / "make.py").read_text().replace("time.sleep(20)", "None"))
-    assert reproduce_side_by_side([], jobs=2).failed == {}
+    assert reproduce_in_parallel([], jobs=2).failed == {}
 
 
 @pytest.mark.slow
@@ -208,7 +208,7 @@ def test_an_incomplete_lock_of_a_killed_process_does_not_stop_later_runs(tmp_pat
     tiny_project(tmp_path)
     RWLOCK.parent.mkdir(parents=True, exist_ok=True)
     RWLOCK.write_text(left)
-    assert reproduce_side_by_side([], jobs=2).failed == {}
+    assert reproduce_in_parallel([], jobs=2).failed == {}
     assert (tmp_path / "a.out").exists()
 
 

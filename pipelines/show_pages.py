@@ -8,7 +8,7 @@ from hoidata.dataset_folders import dataset_title
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
 from hoidata.store.annotated import load_annotated
-from hoidata.store.info import stand_in_note
+from hoidata.store.info import embedded_hand_warning
 from hoidata.store.store import Store, open_store
 from pipelines.pages.clip_page import page_name, write_clip_page
 from pipelines.pages.clip_page_facts import source_frames_text
@@ -21,7 +21,7 @@ from pipelines.stages.base import StagePaths, empty_reason, load_hands
 CLOSEST = 5
 
 
-def write_shown(name: str, profile: str, out: Path) -> Path:
+def write_named_page(name: str, profile: str, out: Path) -> Path:
     """Write the page of the clip or dataset ``name`` of a profile to the folder ``out``; returns its path.
 
     Raises:
@@ -35,12 +35,12 @@ def write_shown(name: str, profile: str, out: Path) -> Path:
     if (paths := _find_sequence(name, profile)) is not None:
         annotated = load_annotated(paths.data, load_hands(profile))
         return write_sequence_page(out / page_name(name), annotated, name.partition("/")[2])
-    paths = find_clip(name, profile, datasets)
+    paths = dataset_of_clip(name, profile, datasets)
     hands = load_hands(profile)
     return write_clip_page(out / page_name(name), load_annotated(paths.data, hands), name, hands)
 
 
-def write_shown_of(folder: Path, clip_id: str, hands: HandPair, out: Path) -> Path:
+def write_page_from(folder: Path, clip_id: str, hands: HandPair, out: Path) -> Path:
     """Write the page of a clip of ``folder`` to the folder ``out``; without an id, the page of the dataset.
 
     Args:
@@ -48,7 +48,7 @@ def write_shown_of(folder: Path, clip_id: str, hands: HandPair, out: Path) -> Pa
         clip_id: "" for the dataset.
 
     Raises:
-        BadInput: as in ``write_shown``.
+        BadInput: as in ``write_named_page``.
     """
     is_store = (folder / "meta").is_dir()
     store = open_store(folder if is_store else folder / "clips", hands)
@@ -78,7 +78,7 @@ def write_stored_clip(out: Path, store: Store, clip_id: str, hands: HandPair) ->
         ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s"),
         ("source frames", source_frames_text(clip)),
         ("files", ", ".join(source.path for source in clip.sources) or "none are recorded"),
-        ("hand model", "; ".join(filter(None, (hands.name, stand_in_note(store.info))))),
+        ("hand model", "; ".join(filter(None, (hands.name, embedded_hand_warning(store.info))))),
         ("licence", str(store.info["licence"])),
     ]
     player = motion_player(clip, hands, title)
@@ -102,7 +102,7 @@ def _is_sequence(store: Store, name: str) -> bool:
     return is_there and name not in store.sequences.index
 
 
-def find_clip(clip_id: str, profile: str, datasets: list[str]) -> StagePaths:
+def dataset_of_clip(clip_id: str, profile: str, datasets: list[str]) -> StagePaths:
     """The dataset that has a clip."""
     stores = {name: store for name in datasets if (store := _store(StagePaths(profile, name))) is not None}
     for name, store in stores.items():

@@ -17,20 +17,20 @@ MAX_HEADER_BYTES = 100_000_000
 MAX_CONTAINERS = 2_000_000  # a list takes sixty bytes of memory, and two in the file
 BLANK = "0" * 64
 # The entry of the metadata before ``sealed``.
-OPEN_SEAL = {"payload_sha256": BLANK, "file_sha256": BLANK}
+EMPTY_CHECKSUMS = {"payload_sha256": BLANK, "file_sha256": BLANK}
 # The metadata is JSON inside JSON, so its quotes are escaped.
 _DIGEST = rb'(\\"%s\\":\\")([0-9a-f]{64})(?=\\")'
 Fault = Literal["weights", "header"]
 
 
 def sealed(data: bytes) -> bytes:
-    """Fill in the checksums of a safetensors file whose metadata has ``OPEN_SEAL``."""
+    """Fill in the checksums of a safetensors file whose metadata has ``EMPTY_CHECKSUMS``."""
     start = _payload_start(data)
     data = _with_digest(data, "payload_sha256", sha256_bytes(data[start:]))
     return _with_digest(data, "file_sha256", sha256_bytes(data))
 
 
-def seal_fault(path: str | Path) -> Fault | None:
+def corrupted_part(path: str | Path) -> Fault | None:
     """The corrupted part of a checksummed file; None for an intact file and for one without checksums."""
     data = Path(path).read_bytes()
     seal = read_metadata(path).get("seal")
@@ -43,9 +43,9 @@ def seal_fault(path: str | Path) -> Fault | None:
     return None if sha256_bytes(blank) == seal.get("file_sha256") else "header"
 
 
-def check_seal(path: str | Path) -> None:
+def verify_checksums(path: str | Path) -> None:
     """Raise BadInput for a file whose checksums do not match."""
-    if fault := seal_fault(path):
+    if fault := corrupted_part(path):
         expected = f"{fault} matching the checksum in the file"
         raise BadInput(path, expected, "others", "restore it with `dvc checkout`, or train it again")
 

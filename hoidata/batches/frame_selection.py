@@ -13,7 +13,7 @@ from hoidata.store.distances import DistanceEntries
 
 
 @dataclass(frozen=True)
-class Sight:
+class FrameSelection:
     """Selected frames of each clip, and the number of distance entries to sample from them."""
 
     frames: np.ndarray  # (clip, K) int64, ascending
@@ -21,16 +21,16 @@ class Sight:
     random: np.random.Generator | None = None
 
     @classmethod
-    def nothing(cls, n_clips: int) -> "Sight":
+    def nothing(cls, n_clips: int) -> "FrameSelection":
         return cls(np.zeros((n_clips, 0), np.int64), 0)
 
     @classmethod
-    def everything(cls, lengths: Sequence[int]) -> "Sight":
+    def everything(cls, lengths: Sequence[int]) -> "FrameSelection":
         """Select all frames of the longest clip, and all entries."""
         return cls(np.tile(np.arange(max(lengths)), (len(lengths), 1)))
 
     @classmethod
-    def drawn(cls, lengths: Sequence[int], count: int, at_most: int, random: np.random.Generator) -> "Sight":
+    def drawn(cls, lengths: Sequence[int], count: int, at_most: int, random: np.random.Generator) -> "FrameSelection":
         """Stratified sampling: one frame from each of ``count`` equal intervals of each clip."""
         column = np.asarray(lengths)[:, None]
         frames = ((np.arange(count) + random.random((len(column), count))) / count * column).astype(np.int64)

@@ -21,9 +21,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from hoidata.errors import BadInput, told_in_words
+from hoidata.errors import BadInput, explain_machine_errors
 from hoidata.files.atomic import exclusive, write_whole
-from hoidata.lifetime import ctrl_c_blocked, end_with_starter
+from hoidata.lifetime import block_ctrl_c, end_with_starter
 from pipelines.warm import WarmProcess
 
 CODE = "pipelines/dvc.yaml:code"
@@ -50,7 +50,7 @@ class Run:
     wall: float = 0.0  # seconds of the whole run
 
 
-def reproduce_side_by_side(
+def reproduce_in_parallel(
     targets: list[str], jobs: int, wrap: Callable[[RunStage], RunStage] | None = None, force: bool = False
 ) -> Run:
     """Bring the targets up to date with up to ``jobs`` parallel stages; the bytes do not depend on ``jobs``.
@@ -152,8 +152,8 @@ def _ask_dvc(targets: list[str], forced: set[str] | None) -> dict[str, frozenset
 
 
 def _check_writable(folder: Path) -> None:
-    """Raise MachineTrouble if DVC could not store the outputs of stages."""
-    with told_in_words():
+    """Raise MachineError if DVC could not store the outputs of stages."""
+    with explain_machine_errors():
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=folder) as stream:
             stream.write(bytes(_PROBE_BYTES))
@@ -310,7 +310,7 @@ class _Children:
         with _without_main():
             if self.ends:
                 return 128 + signal.SIGINT
-            with ctrl_c_blocked():
+            with block_ctrl_c():
                 process.start()
             self.processes.add(process)
         process.join()
