@@ -14,7 +14,7 @@ from hoidata.contact.settings import ContactSettings
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
-from hoidata.objects.user_mesh import read_user_object, two_pieces
+from hoidata.objects.user_mesh import piece_names, read_user_object
 from hoidata.settings import build_config
 from hoidata.store.store import open_store
 from models.common.checkpoints import FILE_NAME, read_info
@@ -101,7 +101,7 @@ def _missing_hinge_notes(verb: str | None, object: str | Path, model: ObjectMode
     problem = f"{verb!r} turns a hinge, but the object has none"
     if not isinstance(object, Path):
         return [f"{problem}: choose one that has"]
-    pieces = two_pieces(object)
+    pieces = piece_names(object)
     if pieces is None:
         return [f"{problem}: it needs a mesh of two objects or nodes, the second of which moves, and --hinge"]
     names = f" ({pieces[0]!r} and {pieces[1]!r})" if all(pieces) else ""

@@ -25,7 +25,10 @@ TURNED_RAD, MOVED_M = np.deg2rad(30), 0.05
 # clip or more. Motion slower than about 1.5 Hz is subtracted first.
 SHAKE_M, SHAKE_HALF_PERIODS, SHAKE_GAP_FRAMES, MIN_SHAKE_FRACTION = 0.015, 6, FPS // 3, 0.2
 SLOW_FRAMES = FPS // 2
-MIN_HOLD_FRACTION = 0.8  # of frames with contact: above it an object at rest is held, below it touched
+MIN_HOLD_FRACTION = 0.8  # of frames with contact: above it an object is held, below it touched
+# A hand that carries an object moves it at least this much; an object that is stiller rests on its support.
+STILL_M, STILL_RAD = 0.003, np.deg2rad(2)
+REST_FRAMES, REST_M = FPS // 6, 0.015  # a placed object moves by less in its last frames
 
 
 class Derived(NamedTuple):
@@ -46,6 +49,8 @@ class ObjectMotion:
     shakes: int  # number of whole oscillations
     shaken_frames: int  # number of frames that they take
     touched: float  # fraction of frames in which a hand is close
+    is_still: bool  # the object rests on its support in all frames
+    ends_at_rest: bool  # the object hardly moves in the last frames
     n_frames: int
 
 
@@ -55,12 +60,12 @@ def derive_verb(clip: Clip, evidence: HandEvidence) -> Derived:
     - open, close: the hinge rotates by 15 degrees or more, away from or towards zero (closed, in ARCTIC).
     - operate: the hinge rotates as far and returns.
     - shake: three fast oscillations or more.
-    - place: the object ends 5 cm lower than it starts. Needs ``clip.gravity``, like lift and grasp.
+    - place: the object ends 5 cm lower than it starts, at rest. Needs ``clip.gravity``, like lift and grasp.
     - lift: the object rises by 10 cm or more.
     - turn: it rotates by 30 degrees or more.
     - move: it moves by 5 cm or more.
     - grasp: it rises by 1.5 cm or more.
-    - hold, or touch if hands are close in less than 80 % of the frames.
+    - hold, or touch if the object rests on its support or hands are close in less than 80 % of the frames.
 
     Args:
         clip: the clip.
@@ -73,7 +78,7 @@ def derive_verb(clip: Clip, evidence: HandEvidence) -> Derived:
         return hinge
     if motion.shaken_frames >= MIN_SHAKE_FRACTION * motion.n_frames:
         return Derived("shake", f"{motion.shakes} swings in {motion.shaken_frames / FPS:.1f} s")
-    if last_m <= -LOWERED_M:
+    if last_m <= -LOWERED_M and motion.ends_at_rest:
         return Derived("place", f"ends {-last_m * 100:.1f} cm lower")
     if highest_m >= LIFTED_M:
         return Derived("lift", f"rises {highest_m * 100:.1f} cm")
@@ -83,7 +88,7 @@ def derive_verb(clip: Clip, evidence: HandEvidence) -> Derived:
         return Derived("move", f"moves {motion.travelled_m * 100:.1f} cm")
     if highest_m >= RAISED_M:
         return Derived("grasp", f"rises {highest_m * 100:.1f} cm, and does not leave its place")
-    verb = "hold" if motion.touched >= MIN_HOLD_FRACTION else "touch"
+    verb = "hold" if motion.touched >= MIN_HOLD_FRACTION and not motion.is_still else "touch"
     return Derived(verb, f"at rest; near in {motion.touched:.0%} of frames")
 
 
@@ -98,15 +103,19 @@ def object_motion(clip: Clip, evidence: HandEvidence) -> ObjectMotion:
     height_m = None if up is None else shift_m @ up
     travel_m = shift_m if up is None or height_m is None else shift_m - np.maximum(height_m, 0)[:, None] * up
     shakes, shaken = _shakes(centre_m)
+    turned_rad = float(_angles(rotation[0].T @ rotation).max())
+    hinge_range_rad = 0.0 if track.hinge_rad is None else float(np.ptp(track.hinge_rad))
     touched = np.any([evidence.near(side) for side in SIDES], axis=0)
     return ObjectMotion(
         hinge_rad=None if track.hinge_rad is None else track.hinge_rad.astype(np.float64),
         height_m=height_m,
         travelled_m=float(np.linalg.norm(travel_m, axis=1).max()),
-        turned_rad=float(_angles(rotation[0].T @ rotation).max()),
+        turned_rad=turned_rad,
         shakes=shakes,
         shaken_frames=shaken,
         touched=float(touched.mean()),
+        is_still=bool(np.ptp(centre_m, axis=0).max() < STILL_M and max(turned_rad, hinge_range_rad) < STILL_RAD),
+        ends_at_rest=bool(np.ptp(centre_m[-REST_FRAMES:], axis=0).max() < REST_M),
         n_frames=clip.n_frames,
     )
 

@@ -161,10 +161,10 @@ class _CountingStream:
         self._count(len(data))
         return data
 
-    def skip(self, size: int) -> None:
+    def skip_bytes(self, count: int) -> None:
         """Skip bytes, which do not count for the limit."""
-        _skip(self.stream, size)
-        self.offset += size
+        _skip(self.stream, count)
+        self.offset += count
 
     def _count(self, size: int) -> None:
         self.n_read += size
@@ -187,7 +187,7 @@ def _without_long_strings(stream: _CountingStream, source: str) -> tuple[bytes, 
             if length > _LONG_BYTES:
                 small_pickle += f"c{_LOCATION}\n{len(locations)}\n".encode()
                 locations.append(_Location(stream.offset, length, opcode.name in _TEXTS))
-                stream.skip(length)
+                stream.skip_bytes(length)
                 continue
             argument += _exactly(stream, length)
         elif opcode.arg is not None:

@@ -129,7 +129,7 @@ def turns_rad(track: ObjectTrack) -> np.ndarray:
 
 
 def moves(track: ObjectTrack) -> np.ndarray:
-    """(frame,) bool: a vertex moves by more than ``MOVED_M``, or the hinge by more than ``TURNED_RAD``."""
+    """(frame,) bool: since the frame before, a vertex moves by more than ``MOVED_M`` or the hinge by more than ``TURNED_RAD``."""
     return (steps_m(track) > MOVED_M) | turns(track)
 
 
@@ -333,7 +333,7 @@ def _percent_of_solid(pair: Pair, values: np.ndarray, condition: Callable[[np.nd
 # --- contact maps
 
 
-def cm_paper(pair: Pair, frame_step: int) -> Values:
+def contact_map_error_paper(pair: Pair, frame_step: int) -> Values:
     """(hand and frame,) mean absolute difference of the generated and the target distance map over points, cm.
 
     Distances are to the nearest of 778 vertices. Unmeasured for a motion without a target map
@@ -342,8 +342,8 @@ def cm_paper(pair: Pair, frame_step: int) -> Values:
     return _map_errors_cm(pair, frame_step, None, np.inf)
 
 
-def cm_corrected(pair: Pair, frame_step: int) -> Values:
-    """(hand and frame,) as ``cm_paper``, to the vertices of the target map, distances capped at 20 cm."""
+def contact_map_error_corrected(pair: Pair, frame_step: int) -> Values:
+    """(hand and frame,) as ``contact_map_error_paper``, to the vertices of the target map, distances capped at 20 cm."""
     target = pair.target_distances
     return _map_errors_cm(pair, frame_step, None if target is None else target.hand_vertices, CAP_M)
 

@@ -14,7 +14,7 @@ from hoidata.metrics.encoded import UNKNOWN, EncodedSet
 from hoidata.metrics.feature_sets import (
     TOO_SMALL,
     Comparison,
-    FeatureResult,
+    FeatureMetricResult,
     cubic_kernel,
     euclidean,
     fid_paired,
@@ -38,7 +38,7 @@ FRECHET_RESAMPLES = 200
 RELEASED_PAIRS, RELEASED_PAIRS_OF_LABEL = 200, 20
 MEMORISED_BELOW = 0.5
 NO_OTHERS = {False: "there is no other sentence", True: "there is no other sentence about the same object"}
-Outcome = FeatureResult | Unmeasured
+Outcome = FeatureMetricResult | Unmeasured
 Measure = Callable[[Comparison], Outcome]
 NO_TRAINING = Unmeasured("there are no training clips")
 
@@ -92,7 +92,7 @@ def _frechet(comparison: Comparison, other: EncodedSet, same_clips: bool) -> Out
         sets = [comparison.predicted]
     counts = (len(comparison.clips), len(comparison.predicted), len(sets))
     if not (has_enough_rows(sets[0].features) and has_enough_rows(other.features)):
-        return FeatureResult(None, *counts, note=TOO_SMALL)
+        return FeatureMetricResult(None, *counts, note=TOO_SMALL)
     runs = [frechet_distance(*gaussian(run.features), *gaussian(other.features)) for run in sets]
     value, first = float(np.mean(runs)), sets[0]
     clip_rows = np.searchsorted(comparison.clips, first.clip)
@@ -109,7 +109,7 @@ def _frechet(comparison: Comparison, other: EncodedSet, same_clips: bool) -> Out
     interval = bootstrap_interval(comparison.clips, comparison.groups, statistic, FRECHET_RESAMPLES, centre=value)
     interval = interval and interval._replace(low=max(interval.low, 0.0))
     note = "" if len(sets) > 1 or len(comparison.repetitions) == 1 else "all repetitions together"
-    return FeatureResult(value, *counts, repetitions=t_interval(runs), bootstrap=interval, note=note)
+    return FeatureMetricResult(value, *counts, repetitions=t_interval(runs), bootstrap=interval, note=note)
 
 
 def distance_of_halves(
@@ -132,10 +132,10 @@ def distance_of_halves(
 def lower_bound(distance: Callable[[np.ndarray, np.ndarray], float | None]) -> Measure:
     """The distance between halves of the recorded clips: no generator can be expected to score lower."""
 
-    def measure(comparison: Comparison) -> FeatureResult:
+    def measure(comparison: Comparison) -> FeatureMetricResult:
         value, size = distance_of_halves(comparison.reference, distance), len(comparison.reference)
         note = TOO_SMALL if value is None else ""
-        return FeatureResult(value, clips=size, motions=size, values=HALVES, note=note)
+        return FeatureMetricResult(value, clips=size, motions=size, values=HALVES, note=note)
 
     return measure
 
@@ -214,7 +214,7 @@ def multimodality_released(comparison: Comparison) -> Outcome:
     if not runs:
         return Unmeasured("there are no motions")
     counts = (len(comparison.clips), len(comparison.predicted), len(runs))
-    return FeatureResult(float(np.mean(runs)), *counts, t_interval(runs), note="no interval over clips")
+    return FeatureMetricResult(float(np.mean(runs)), *counts, t_interval(runs), note="no interval over clips")
 
 
 def multimodality_by_prompt(comparison: Comparison) -> Outcome:

@@ -34,7 +34,7 @@ from hoidata.metrics.feature_measures import (
     r_precision,
     r_precision_chance,
 )
-from hoidata.metrics.feature_sets import TOO_SMALL, Comparison, FeatureResult, fid_frechet, kid
+from hoidata.metrics.feature_sets import TOO_SMALL, Comparison, FeatureMetricResult, fid_frechet, kid
 from hoidata.metrics.pair import acting_sides
 from hoidata.metrics.paths import PathEncoder
 from hoidata.metrics.registry import OWN, Direction
@@ -70,7 +70,7 @@ class FeatureMetric:
 
 def feature_results(
     predicted: EncodedSet, reference: EncodedSet, train: EncodedSet | None = None
-) -> dict[str, FeatureResult | Unmeasured]:
+) -> dict[str, FeatureMetricResult | Unmeasured]:
     """All metrics of the encoder that made the three sets, by name.
 
     Raises ValueError if the sets come from different encoders.
@@ -244,7 +244,7 @@ def _predicted(
 _BY_METRIC = ("figures", "intervals", "counts", "notes", "unmeasured")
 
 
-def _add(summary: dict[str, Any], name: str, figure: FeatureResult | Unmeasured, clips: int) -> None:
+def _add(summary: dict[str, Any], name: str, figure: FeatureMetricResult | Unmeasured, clips: int) -> None:
     """clips: how many are compared."""
     if isinstance(figure, Unmeasured):
         summary["unmeasured"][name] = {figure.reason: clips}

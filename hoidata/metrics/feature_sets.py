@@ -17,7 +17,7 @@ from hoidata.metrics.intervals import Interval, Statistic, bootstrap_interval, t
 from hoidata.metrics.unmeasured import Unmeasured
 
 
-class FeatureResult(NamedTuple):
+class FeatureMetricResult(NamedTuple):
     """The value of a feature metric with its counts and 95 % intervals."""
 
     value: float | None  # None: it would mislead, for the reason ``note``
@@ -70,7 +70,7 @@ def rows_of_clips(clips: np.ndarray, encoded: EncodedSet) -> np.ndarray:
 
 def mean_result(
     comparison: Comparison, values: np.ndarray, note: str = "", by_repetition: bool = True, without: str = "no value"
-) -> FeatureResult | Unmeasured:
+) -> FeatureMetricResult | Unmeasured:
     """The mean of (motion,) values with intervals.
 
     Args:
@@ -92,7 +92,7 @@ def mean_result(
     value = float(runs.mean() if by_repetition else means.mean())
     missing = without if len(clips) < len(comparison.clips) else ""
     over_clips = bootstrap_interval(means, groups)
-    return FeatureResult(value, *counts, repetitions=over_runs, bootstrap=over_clips, note=note, without=missing)
+    return FeatureMetricResult(value, *counts, repetitions=over_runs, bootstrap=over_clips, note=note, without=missing)
 
 
 def set_result(
@@ -102,7 +102,7 @@ def set_result(
     statistic: Statistic,
     note: str = "",
     without: str = "fewer than two clips",
-) -> FeatureResult | Unmeasured:
+) -> FeatureMetricResult | Unmeasured:
     """The mean of a metric of whole sets over repetitions, with intervals.
 
     Args:
@@ -116,7 +116,7 @@ def set_result(
     over_clips = bootstrap_interval(values, comparison.groups, statistic)
     counts = (len(comparison.clips), len(comparison.predicted), len(runs))
     value = float(np.mean(runs))
-    return FeatureResult(value, *counts, repetitions=t_interval(runs), bootstrap=over_clips, note=note)
+    return FeatureMetricResult(value, *counts, repetitions=t_interval(runs), bootstrap=over_clips, note=note)
 
 
 def mean_matrix(comparison: Comparison, matrix_of: Callable[[EncodedSet], np.ndarray]) -> np.ndarray:

@@ -94,11 +94,11 @@ BIMART_METRICS: tuple[Metric, ...] = (
         ),
     ),
     Metric(
-        "bimart_cm_paper", bimart.cm_paper, topic="BimArt", title="CM: error of the contact map, paper", unit="cm",
+        "bimart_cm_paper", bimart.contact_map_error_paper, topic="BimArt", title="CM: error of the contact map, paper", unit="cm",
         direction="lower", source=f"{BIMART}, to 778 vertices: `asked-distances.npz` next to the clips", samples=1,
     ),
     Metric(
-        "bimart_cm_corrected", bimart.cm_corrected, topic="BimArt", unit="cm",
+        "bimart_cm_corrected", bimart.contact_map_error_corrected, topic="BimArt", unit="cm",
         title="CM: error of the contact map, corrected", direction="lower",
         source=f"{_CORRECTED}: to the hand vertices of the target map", thresholds="distances capped at 20 cm",
     ),

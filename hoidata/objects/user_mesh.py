@@ -203,7 +203,7 @@ def _in_two_pieces(path: Path, file: _MeshFile) -> tuple[Mesh, np.ndarray, tuple
     return mesh, (key % 2).astype(np.uint8), _names(pieces)
 
 
-def two_pieces(path: Path) -> tuple[str, str] | None:
+def piece_names(path: Path) -> tuple[str, str] | None:
     """Names of the two pieces of which ``--hinge`` rotates the second ("" if unnamed); None for any other mesh."""
     pieces = _division_into_two(_divisions(_read(path)))
     return None if pieces is None else _names(pieces)

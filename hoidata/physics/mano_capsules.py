@@ -1,7 +1,7 @@
 """A hand in MANO's layout as ManipNet's 19 capsules: 4 of the palm, then 3 of each finger.
 
 Each capsule is fitted to its segment of the skin in the rest shape and moves rigidly with its joint. The grasp search
-of the embedded corpora uses 21 other capsules (``synthetic.hand_capsules``).
+that generates the synthetic corpora uses a different hand of 21 capsules (``synthetic.hand_capsules``).
 """
 
 from functools import lru_cache

@@ -5,8 +5,8 @@ point of the shape. BimArt encodes each part of an object separately (Sec. 3.1, 
 
 Rotating the moving part is equivalent to rotating the basis points the other way. Each basis point then moves on a
 circle past fixed vertices. On a short arc only a few vertices can be the nearest one. These candidates are found once
-per arc and object; the fixed base needs one query. Distances are compared in float64, so that the result equals a k-d
-tree query of every frame's vertices, ties aside.
+per arc and object; the fixed base needs one query. Distances are compared in float64, so that the result equals that
+of a k-d tree built from the vertices of each frame, except for ties.
 
 All points are in the canonical frame of the object: hinge along -z through the origin, metres.
 """
@@ -59,7 +59,7 @@ class BasisSettings:
 
 
 class NearestPoints(NamedTuple):
-    """The point of an object nearest to each basis point, per frame; basis points as ``BasisSettings.places``."""
+    """For each frame and basis point, the nearest point of the object. ``BasisSettings.places`` has the basis points."""
 
     point_m: np.ndarray  # (frame, basis point, 3) float32 in the canonical frame
     offset: np.ndarray  # (frame, basis point, 3) float32 vector from the basis point, scaled (Eq. 2)

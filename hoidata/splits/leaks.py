@@ -1,4 +1,4 @@
-"""Leak check: subjects, objects, files or frames that two parts of a split share although the split excludes it."""
+"""Leak check: subjects, objects, files or frames that are in two parts of a split although they must not be."""
 
 import fnmatch
 from collections import defaultdict

@@ -27,7 +27,7 @@ class TrackedFrame:
 
 
 class Stream:
-    """Predicts finger poses from pushed frames.
+    """Predicts finger poses while a tracker delivers frames.
 
     Pose k is for k network steps after the first frame, at any frame rate of the tracker. ``push`` returns it once the
     frames within the look-ahead have arrived; ``finish`` returns the remaining poses.

@@ -45,7 +45,7 @@ ROUGH, DEVIATION = 0.3, 0.5
 
 
 def turned_since_start(objects: Tensor) -> Tensor:
-    """Object features (F, 10) with the rotation since the first frame, and that frame's rotation appended: (F, 16)."""
+    """Object features (F, 16): rotations become relative to the first frame, whose rotation (6 numbers) is appended."""
     rotation = object_rotmat(objects)
     since_start_6d, start_6d = rotmat_to_rot6d(rotation @ rotation[0].T), rotmat_to_rot6d(rotation[:1])
     start_6d = start_6d.expand(len(objects), -1)

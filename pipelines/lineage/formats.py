@@ -132,7 +132,7 @@ def _qualified(kind: str, name: str) -> str:
 
 
 def write_lineage_page(path: Path, tree: Node, record: dict[str, Any], sources: Sequence[RawSource]) -> Path:
-    """Write a self-contained page; nodes that differ from the record are expanded, all others are collapsed."""
+    """Write the lineage tree as one HTML file. Nodes whose files changed since the checkpoint are expanded."""
     from pipelines.pages.player import write_page  # imports the motion player
 
     status = overall_status(tree)

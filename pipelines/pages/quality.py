@@ -1,4 +1,4 @@
-"""Quality control of one dataset on the report: tables, a histogram of every measure, and excluded clips."""
+"""The report's section on quality control: tables, a histogram per measure, and the excluded clips of one dataset."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence

@@ -23,6 +23,7 @@ from hoidata.datasets.arctic.files import (
 )
 from hoidata.datasets.base import AdapterBase, DatasetPart, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.known_meshes import raw_mesh
+from hoidata.datasets.segments import segment_clips
 from hoidata.errors import BadInput
 from hoidata.files import load_npy_object
 from hoidata.geometry.rotations import canonical_rotvec
@@ -65,7 +66,7 @@ MOTION_PARTS = (
 )
 WITHHELD_SUBJECT = "s03"
 KINDS = ("mano.npy", "object.npy", "egocam.dist.npy", "smplx.npy")
-ClipSource = Literal["described", "whole", "described-else-whole"]
+ClipSource = Literal["described", "whole", "segments", "described-else-segments"]
 
 
 @dataclass(frozen=True)
@@ -86,8 +87,9 @@ class _Motion:
 class ArcticAdapter(AdapterBase):
     """Raw root: the folder with ``raw_seqs/``, ``meta/`` and ``description/`` (or ``data/`` above them).
 
-    ``clips`` selects the clips: "described" gives one clip per line of Text2HOI's description files, "whole" one clip
-    without a verb per sequence, and "described-else-whole" the latter only for sequences without a description.
+    ``clips`` selects the clips: "described" gives one clip per line of Text2HOI's description files. Without
+    descriptions, "segments" cuts a sequence by contact and motion (``hoidata.datasets.segments``), "whole" gives one
+    clip per sequence. "described-else-segments" cuts only the sequences without a description.
     """
 
     facts = facts_of_adapter(__file__)
@@ -111,7 +113,7 @@ class ArcticAdapter(AdapterBase):
             patterns=files,
             archive=archive,
             optional=optional,
-            unneeded_with="clips=whole",
+            unneeded_with="clips=segments",
         )
         return (*MOTION_PARTS, descriptions)
 
@@ -126,10 +128,11 @@ class ArcticAdapter(AdapterBase):
         return [SequenceKey(self.name, subject, f"{subject}/{stem}") for subject, stem in sorted(names)]
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
-        """One clip per described range of at least 20 frames, or one clip of the whole sequence."""
+        """One clip per described range of at least 20 frames, per segment, or per sequence."""
         path = _path_in_copy(raw, f"description/{key.name}/description.txt")
-        if self.clips == "whole" or (self.clips == "described-else-whole" and not raw.has(path)):
-            return [self._whole(raw, key, _read_motion(raw, key, hands, self.body))]
+        if self.clips in ("whole", "segments") or (self.clips != "described" and not raw.has(path)):
+            whole = self._whole(raw, key, _read_motion(raw, key, hands, self.body))
+            return [whole] if self.clips == "whole" else list(segment_clips(whole, hands))
         descriptions, results = _read_descriptions(raw, path, key)
         motion = _read_motion(raw, key, hands, self.body)
         object_name = motion.object.model.name
@@ -205,7 +208,7 @@ def _read_descriptions(raw: RawTree, path: str, key: SequenceKey) -> tuple[list[
     if not raw.has(path):
         remedy = (
             "add Text2HOI's description files; where none was published (espressomachine), nothing to do, or set "
-            "clips: described-else-whole"
+            "clips: described-else-segments"
         )
         raise BadInput(path, "a description of the sequence's segments", "no file", remedy)
     described, problems = parse_descriptions(raw.read(path), path)

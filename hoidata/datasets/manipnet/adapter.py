@@ -338,7 +338,7 @@ def _read_tips(raw: RawTree) -> dict[str, np.ndarray]:
 
 
 def _body(name: str, motion: BvhMotion) -> BodyMotion:
-    """Position and rotation of a motion's root, with all numbers of the file."""
+    """Position and rotation of a BVH file's root joint, and the values of all its channels."""
     root = replace(
         motion, names=motion.names[:1], parents=motion.parents[:1], angles_yxz_rad=motion.angles_yxz_rad[:, :1]
     )

@@ -58,6 +58,7 @@ def along(axis: int, metres: np.ndarray) -> np.ndarray:
 
 
 LIFT = clip(BOX, path_m=along(2, 0.15 * SMOOTH))
+HELD = clip(BOX, path_m=along(2, 0.01 * SMOOTH))  # in a hand, hardly moving
 SLIDE = clip(BOX, path_m=along(0, 0.12 * SMOOTH))
 # The verb of a motion, and of the motion backwards.
 EITHER_WAY = {
@@ -67,7 +68,7 @@ EITHER_WAY = {
     "a hinge turns by 11 degrees": (clip(NOTEBOOK, hinge_rad=0.2 + 0.2 * SMOOTH), "hold", "hold"),
     "a hinge turns by 13 degrees": (clip(NOTEBOOK, hinge_rad=0.1 + np.deg2rad(13) * SMOOTH), "hold", "hold"),
     "a hinge turns by 17 degrees": (clip(NOTEBOOK, hinge_rad=0.1 + np.deg2rad(17) * SMOOTH), "open", "close"),
-    "at rest": (clip(BOX), "hold", "hold"),
+    "at rest": (clip(BOX), "touch", "touch"),
     "a rise": (LIFT, "lift", "place"),
     "a rise upside down": (replace(LIFT, gravity=-DOWN), "place", "lift"),
     "a rise without gravity": (replace(LIFT, gravity=None), "move", "move"),
@@ -123,8 +124,21 @@ def test_swings_in_less_than_a_fifth_of_the_clip_do_not_name_it() -> None:
 
 
 def test_at_rest_the_share_of_touched_frames_tells_hold_from_touch() -> None:
-    assert verb(clip(BOX), near=0.9) == "hold"
-    assert verb(clip(BOX), near=0.5) == "touch"
+    assert verb(HELD, near=0.9) == "hold"
+    assert verb(HELD, near=0.5) == "touch"
+
+
+def test_an_object_that_rests_on_its_support_is_touched_not_held() -> None:
+    noise = np.random.default_rng(0).normal(0, 0.0003, (FRAMES, 3))
+    assert verb(clip(BOX, path_m=noise), near=1) == "touch"
+    assert verb(clip(BOX, path_m=noise + along(0, 0.006 * SMOOTH)), near=1) == "hold"
+
+
+def test_an_object_that_is_lowered_but_does_not_come_to_rest_is_not_placed() -> None:
+    lowered = along(2, -0.15 * SMOOTH[:: FRAMES // 45][:45].repeat(2))
+    assert verb(clip(BOX, path_m=lowered)) == "place"
+    falling = along(2, -0.3 * PHASE**2)
+    assert verb(clip(BOX, path_m=falling)) == "move"
 
 
 def test_a_frame_is_touched_by_either_hand() -> None:
@@ -134,8 +148,8 @@ def test_a_frame_is_touched_by_either_hand() -> None:
         "right": np.where(PHASE < 0.5, 0.1, 0.01),
     }
     result = HandEvidence(None, distance, 0.02).at_threshold(0.02)
-    assert object_motion(clip(BOX), result).touched == 1
-    assert derive_verb(clip(BOX), result).verb == "hold"
+    assert object_motion(HELD, result).touched == 1
+    assert derive_verb(HELD, result).verb == "hold"
 
 
 SWING = along(0, 0.02 * np.sin(2 * np.pi * 4 * np.arange(FRAMES) / 30))

@@ -325,16 +325,16 @@ def target_of(clip, off_m=0.0, hand_vertices=None):
 def test_cm_is_the_distance_between_the_generated_and_the_target_map(make_clip, pair_of):
     clip = make_clip(6, "both", articulated=True)
     pair = replace(pair_of(clip, clip, "both"), target_distances=target_of(clip, 0.01))
-    assert bimart.cm_paper(pair, 1) == pytest.approx(np.ones(12), abs=1e-4)
+    assert bimart.contact_map_error_paper(pair, 1) == pytest.approx(np.ones(12), abs=1e-4)
     few = target_of(clip, hand_vertices=np.arange(0, 778, 10))
     pair = replace(pair, target_distances=few)
-    assert bimart.cm_corrected(pair, 1) == pytest.approx(np.zeros(12), abs=1e-4)
-    assert (bimart.cm_paper(pair, 1) > 0.01).all()  # a map of few vertices is farther than one of all
+    assert bimart.contact_map_error_corrected(pair, 1) == pytest.approx(np.zeros(12), abs=1e-4)
+    assert (bimart.contact_map_error_paper(pair, 1) > 0.01).all()  # a map of few vertices is farther than one of all
     nothing = few._replace(distance_m=np.full_like(few.distance_m, np.nan))
-    assert len(bimart.cm_paper(replace(pair, target_distances=nothing), 1)) == 0
-    assert len(bimart.cm_paper(pair_of(clip, clip, "both"), 1)) == 0
+    assert len(bimart.contact_map_error_paper(replace(pair, target_distances=nothing), 1)) == 0
+    assert len(bimart.contact_map_error_paper(pair_of(clip, clip, "both"), 1)) == 0
     far = few._replace(distance_m=np.full_like(few.distance_m, 5.0))
-    assert bimart.cm_corrected(replace(pair, target_distances=far), 1).max() < 20
+    assert bimart.contact_map_error_corrected(replace(pair, target_distances=far), 1).max() < 20
 
 
 def test_target_distances_survive_the_file_to_a_tenth_of_a_millimetre(make_clip, tmp_path):

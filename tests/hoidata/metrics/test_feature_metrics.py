@@ -9,7 +9,7 @@ import pytest
 from hoidata.metrics.encoded import UNKNOWN, EncodedSet
 from hoidata.metrics.feature_measures import ranks
 from hoidata.metrics.feature_metrics import FEATURE_METRICS, feature_results
-from hoidata.metrics.feature_sets import TOO_SMALL, FeatureResult, fid_frechet, fid_paired, frechet_distance, kid
+from hoidata.metrics.feature_sets import TOO_SMALL, FeatureMetricResult, fid_frechet, fid_paired, frechet_distance, kid
 from hoidata.metrics.unmeasured import Unmeasured
 
 CLIPS, LABELS = 60, ("close", "lift", "open")
@@ -36,9 +36,9 @@ def encoded(features, samples=1, encoder="corrected", seed=0, **changes) -> Enco
     return replace(encoding, **changes)
 
 
-def measured_features(*sets) -> dict[str, FeatureResult]:
+def measured_features(*sets) -> dict[str, FeatureMetricResult]:
     """The results of ``feature_results`` without unmeasured metrics."""
-    return {name: result for name, result in feature_results(*sets).items() if isinstance(result, FeatureResult)}
+    return {name: result for name, result in feature_results(*sets).items() if isinstance(result, FeatureMetricResult)}
 
 
 def normal(rows, size=4, seed=0, shift=0.0) -> np.ndarray:

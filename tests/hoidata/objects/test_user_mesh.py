@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from hoidata.errors import BadInput
-from hoidata.objects.user_mesh import read_mesh_file, read_user_object, thinned, two_pieces
+from hoidata.objects.user_mesh import piece_names, read_mesh_file, read_user_object, thinned
 
 MUG = trimesh.creation.cylinder(radius=0.04, height=0.1, sections=48)
 Y_UP = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
@@ -214,11 +214,11 @@ def test_without_names_of_two_parts_the_shells_are_counted(tmp_path):
 
 def test_the_two_pieces_of_a_mesh_are_named_and_a_mesh_of_one_or_three_has_none(tmp_path):
     (tmp_path / "box.obj").write_text(obj_text())
-    assert two_pieces(tmp_path / "box.obj") == ("body", "lid")
+    assert piece_names(tmp_path / "box.obj") == ("body", "lid")
     saved(pieces_of_boxes([0, 0, 0], [0.1, 0, 0]), tmp_path / "two.ply")
-    assert two_pieces(tmp_path / "two.ply") == ("", "")
+    assert piece_names(tmp_path / "two.ply") == ("", "")
     for corners in ([[0, 0, 0]], [[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]]):
-        assert two_pieces(saved(pieces_of_boxes(*corners), tmp_path / "other.ply")) is None
+        assert piece_names(saved(pieces_of_boxes(*corners), tmp_path / "other.ply")) is None
 
 
 def test_a_binary_stl_may_begin_with_the_word_of_a_text(tmp_path):

@@ -117,18 +117,18 @@ def test_espressomachine_has_no_description_and_is_used_as_a_whole(root, load_al
     assert "espressomachine" in caught.value.remedy
 
 
-def test_sequences_without_a_description_can_be_whole_next_to_described_ones(root, load_all):
+def test_sequences_without_a_description_can_be_cut_into_segments_next_to_described_ones(root, load_all):
     described = load_all(ArcticAdapter(), root)
     recording.write_sequence(root, "espressomachine_use_01")
     recording.write_template(root, "espressomachine")
     (root / "description/s04/espressomachine_use_01/description.txt").unlink()
-    both = load_all(ArcticAdapter(clips="described-else-whole"), root)
+    both = load_all(ArcticAdapter(clips="described-else-segments"), root)
     words = [(clip.clip_id, clip.verb, clip.n_frames) for clip in both]
     whole = ("arctic/s04/espressomachine_use_01", None, 70)
     assert sorted(words, key=str) == sorted([*((c.clip_id, c.verb, c.n_frames) for c in described), whole], key=str)
 
 
-@pytest.mark.parametrize("clips", ["described", "whole"])
+@pytest.mark.parametrize("clips", ["described", "whole", "segments"])
 def test_the_test_subject_whose_motion_is_withheld_is_named_as_such(root, hands, tmp_path_factory, clips):
     source, folder = root / "raw_seqs" / "s04", root / "raw_seqs" / "s03"
     folder.mkdir()
@@ -140,7 +140,7 @@ def test_the_test_subject_whose_motion_is_withheld_is_named_as_such(root, hands,
     assert quarantined.source_key == "arctic/s03/box_grab_01"
     assert "withholds the motion of its test subject s03" in quarantined.got
     assert quarantined.remedy.startswith("nothing to do")
-    assert summary.clips == {"described": 4, "whole": 1}[clips]
+    assert summary.clips == {"described": 4, "whole": 1, "segments": 1}[clips]
 
 
 def test_a_withheld_sequence_someone_does_have_converts_like_any_other(root, load_all):
