@@ -129,7 +129,7 @@ def turns_rad(track: ObjectTrack) -> np.ndarray:
 
 
 def moves(track: ObjectTrack) -> np.ndarray:
-    """(frame,) bool: since the frame before, a vertex moves by more than ``MOVED_M`` or the hinge by more than ``TURNED_RAD``."""
+    """(frame,) bool: a vertex moved by more than ``MOVED_M`` since the frame before, or the hinge by ``TURNED_RAD``."""
     return (steps_m(track) > MOVED_M) | turns(track)
 
 
@@ -343,7 +343,7 @@ def contact_map_error_paper(pair: Pair, frame_step: int) -> Values:
 
 
 def contact_map_error_corrected(pair: Pair, frame_step: int) -> Values:
-    """(hand and frame,) as ``contact_map_error_paper``, to the vertices of the target map, distances capped at 20 cm."""
+    """(hand and frame,) as ``contact_map_error_paper``, to the target map's vertices, distances capped at 20 cm."""
     target = pair.target_distances
     return _map_errors_cm(pair, frame_step, None if target is None else target.hand_vertices, CAP_M)
 

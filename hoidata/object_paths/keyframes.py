@@ -131,7 +131,7 @@ def _rotations_between(keys: Keyframes, source: str) -> np.ndarray:
 
 
 def _interpolated_rotations(keys: Keyframes, rotations: np.ndarray, at_s: np.ndarray) -> np.ndarray:
-    """Interpolate keyframe rotations: (frame, 3, 3) at times ``at_s``; about a common axis if they have one, else by slerp."""
+    """Interpolate rotations at times ``at_s``: (frame, 3, 3). About a common axis if they have one, else by slerp."""
     axis = _common_axis(rotations)
     if axis is not None:
         angle = smooth(keys.time_s, np.append(0.0, np.cumsum(rotations @ axis)), at_s)

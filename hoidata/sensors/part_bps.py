@@ -59,7 +59,7 @@ class BasisSettings:
 
 
 class NearestPoints(NamedTuple):
-    """For each frame and basis point, the nearest point of the object. ``BasisSettings.places`` has the basis points."""
+    """For each frame and basis point (``BasisSettings.places``), the nearest point of the object."""
 
     point_m: np.ndarray  # (frame, basis point, 3) float32 in the canonical frame
     offset: np.ndarray  # (frame, basis point, 3) float32 vector from the basis point, scaled (Eq. 2)
