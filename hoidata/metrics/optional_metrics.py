@@ -95,7 +95,8 @@ BIMART_METRICS: tuple[Metric, ...] = (
     ),
     Metric(
         "bimart_cm_paper", bimart.contact_map_error_paper, topic="BimArt", title="CM: error of the contact map, paper",
-        unit="cm", direction="lower", source=f"{BIMART}, to 778 vertices: `asked-distances.npz` next to the clips", samples=1,
+        unit="cm", direction="lower", samples=1,
+        source=f"{BIMART}, to 778 vertices: `asked-distances.npz` next to the clips",
     ),
     Metric(
         "bimart_cm_corrected", bimart.contact_map_error_corrected, topic="BimArt", unit="cm",
