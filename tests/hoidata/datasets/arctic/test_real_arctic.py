@@ -7,11 +7,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.clips.clip import SIDES, Clip
+from hoidata.annotation.derived import derive_verb
+from hoidata.clips.clip import SIDES, Clip, Side
+from hoidata.contact.maps import find_active_hands
+from hoidata.contact.proximity import ProximityIndex
 from hoidata.datasets import RawTree, SequenceKey
 from hoidata.datasets.arctic.adapter import ArcticAdapter
 from hoidata.files import load_npy_object
 from hoidata.hands import HandPair, load_mano_hands, track_joints
+from hoidata.objects.sampling import sample_points
+from hoidata.store.hand_evidence import HandEvidence
 
 ROOT = Path(os.environ.get("HOIDATA_ARCTIC", ""))
 # Finger rotations of the source reach 7.9, 7.7 and 7.6 rad in these; the fourth has none beyond pi.
@@ -57,3 +62,38 @@ def test_finger_rotations_of_a_real_sequence_are_the_sources_and_at_most_pi(name
         assert np.linalg.norm(stored, axis=1).max() <= np.pi + 1e-6
         longest = max(longest, float(np.linalg.norm(meant, axis=1).max()))
     assert (longest > 7) == (name != SEQUENCES[-1])
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_segments_of_a_real_sequence_cover_its_contact_and_have_contact_and_a_verb(name: str, hands: HandPair) -> None:
+    key = SequenceKey("arctic", name.partition("/")[0], name)
+    clips = ArcticAdapter(clips="segments").load(RawTree(ROOT), key, hands)
+    whole = whole_clip(name, hands)
+    near = np.any([evidence_of(whole, hands).near(side) for side in SIDES], axis=0)
+    covered = np.zeros(whole.n_frames, bool)
+    for clip in clips:
+        assert isinstance(clip, Clip)
+        assert clip.n_frames <= 150
+        evidence = evidence_of(clip, hands)
+        assert evidence.hand_type is not None
+        assert derive_verb(clip, evidence).verb
+        covered[clip.source_frames] = True
+    assert (near & covered).sum() >= 0.9 * near.sum()
+    again = ArcticAdapter(clips="segments").load(RawTree(ROOT), key, hands)
+    assert [getattr(clip, "clip_id", None) for clip in again] == [getattr(clip, "clip_id", None) for clip in clips]
+
+
+def test_the_hinge_moves_in_recordings_of_use_and_hardly_in_recordings_of_grasps(hands: HandPair) -> None:
+    """ARCTIC names a sequence by its intent: the derived verbs agree with it."""
+    fractions = []
+    for name in ("s01/box_use_01", "s01/box_grab_01"):
+        clips = ArcticAdapter(clips="segments").load(RawTree(ROOT), SequenceKey("arctic", "s01", name), hands)
+        verbs = [derive_verb(clip, evidence_of(clip, hands)).verb for clip in clips if isinstance(clip, Clip)]
+        fractions.append(np.mean([verb in ("open", "close", "operate") for verb in verbs]))
+    assert fractions[0] > 0.3
+    assert fractions[1] == 0
+
+
+def evidence_of(clip: Clip, hands: HandPair) -> HandEvidence:
+    joints_m: dict[Side, np.ndarray] = {side: track_joints(clip.hands[side], hands[side]) for side in SIDES}
+    return find_active_hands(clip, joints_m, ProximityIndex(sample_points(clip.object.model, 1024)))
