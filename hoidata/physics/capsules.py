@@ -130,7 +130,7 @@ def _part_contacts(
 def _candidates(
     box_m: np.ndarray, start: np.ndarray, end: np.ndarray, reach_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frame and capsule of candidates, whose bounding box widened by ``reach_m`` overlaps the part's box_m (6,)."""
+    """Frame and capsule index of capsules whose bounding box, grown by ``reach_m``, overlaps ``box_m`` (6,)."""
     low, high = np.minimum(start, end) - reach_m[:, None], np.maximum(start, end) + reach_m[:, None]
     frame, capsule = np.nonzero(((low < box_m[3:]) & (high > box_m[:3])).all(axis=-1))
     return frame, capsule

@@ -86,7 +86,7 @@ def our_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarra
 
     Algorithm 1 has three problems. It stops at the surface, where a contact has no pressure. A predicted distance is a
     mean over many poses, so it lifts touching points off the object. In a thin object, the nearest surface may be on
-    the far side. So our rule presses, and moves points outward only if they enter the object. It takes the surface
+    the far side. So our rule presses near points against the object, and moves points outward only if they are inside. It takes the surface
     plane at the pose that the solver starts from (``nearest``): a point below that plane is inside.
 
     Args:
@@ -161,7 +161,7 @@ class FrameContext:
 def frame_context(
     control: Control, side: Side, hand: TrackedHand, time_s: float, settings: FeatureSettings
 ) -> FrameContext:
-    """The control signal at one time. One call per time, because the last bits depend on the batch size."""
+    """Wrist and object trajectories around one time. One call per time: the last bits depend on the batch size."""
     times_s = np.array([time_s])
     transforms, hinge = object_from_wrist(control, side, times_s, settings)
     trajectory = trajectory_features(control, side, hand, times_s, settings)

@@ -65,7 +65,7 @@ class Stream:
         return self._ready_poses(frame.time_s - self._ahead_s)
 
     def finish(self) -> list[dict[Side, np.ndarray]]:
-        """Return the remaining poses; wrists and objects rest after the last frame."""
+        """End the stream: return the poses not yet returned, as if wrists and objects rested after the last frame."""
         return self._ready_poses(np.inf)
 
     def _ready_poses(self, until_s: float) -> list[dict[Side, np.ndarray]]:

@@ -54,7 +54,7 @@ def source_of(name: str) -> str:
 
 
 def source_paths(paths: StagePaths) -> StagePaths:
-    """The paths of a variant's source."""
+    """The paths of the dataset that a variant such as ``arctic-whole`` is converted from."""
     return replace(paths, dataset=source_of(paths.dataset))
 
 
