@@ -86,8 +86,9 @@ def our_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarra
 
     Algorithm 1 has three problems. It stops at the surface, where a contact has no pressure. A predicted distance is a
     mean over many poses, so it lifts touching points off the object. In a thin object, the nearest surface may be on
-    the far side. So our rule presses near points against the object, and moves points outward only if they are inside. It takes the surface
-    plane at the pose that the solver starts from (``nearest``): a point below that plane is inside.
+    the far side. So our rule presses near points against the object, and moves points outward only if they are
+    inside. It takes the surface plane at the pose that the solver starts from (``nearest``): a point below that
+    plane is inside.
 
     Args:
         points_m: (point, 3) of the predicted pose.
