@@ -30,15 +30,16 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 docs: install-dev
 	NO_MKDOCS_2_WARNING=1 mkdocs build --strict --quiet
 
+# Three processes: with two, cores wait for servers and killed processes.
 test: install-dev
-	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope -m "not long"
+	OMP_NUM_THREADS=1 pytest -n 3 --dist loadscope -m "not long"
 
 test-fast: install-dev
 	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope -m "not slow and not long"
 
 # Whole runs and trainings, each of 20 seconds or more; CI runs them after `make check`.
 test-long: install-dev
-	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope -m long
+	OMP_NUM_THREADS=1 pytest -n 3 --dist loadscope -m long
 
 # Every situation that may stop a run, three times each; `make test` has a share of it.
 chaos: install-dev

@@ -20,6 +20,7 @@ import trimesh
 
 from fuzz.engine import MAX_INPUT_BYTES, Target
 from hoidata.clips.clip import SourceFile
+from hoidata.datasets import checks
 from hoidata.datasets.arctic import files as arctic
 from hoidata.datasets.base import RawTree
 from hoidata.datasets.h2o import files as h2o
@@ -354,7 +355,7 @@ def _hoi4d_json(data: bytes) -> object:
     if b"event" in data or not data.strip():
         return hoi4d.action_events(data, "color.json")
     with contextlib.suppress(BadInput):
-        hoi4d._meshes_by_id(hoi4d.read_json(data, "result.json"), "result.json")
+        hoi4d._meshes_by_id(checks.json_value("result.json", data), "result.json")
     return hoi4d.hinge_joint(data, TREE, "mobility_v2.json", "result.json")
 
 

@@ -65,7 +65,7 @@ def _take_compiled(package: Path) -> None:
             os.utime(target, ns=(source.stat().st_atime_ns, source.stat().st_mtime_ns))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_project_of_the_wheel_gives_the_bytes_of_a_clone(python, tmp_path, small_corpus):
     project = tmp_path / "project"
     assert run(python, tmp_path, "-m", "hoidata", "init", "project").returncode == 0

@@ -4,14 +4,16 @@ import json
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 from rich.console import Console
 
 from hoidata.errors import MissingResource
 from pipelines.commands.project import enter_project, hands_of
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 def compare(
@@ -63,9 +65,11 @@ def compare(
         write_whole(out, json.dumps(written, indent=1, sort_keys=True, allow_nan=False) + "\n")
 
 
-def _mean(values: np.ndarray) -> str:
+def _mean(values: "np.ndarray") -> str:
     return f"{values.mean():.3g}" if len(values) else "not measured"
 
 
-def _spread(values: np.ndarray) -> str:
+def _spread(values: "np.ndarray") -> str:
+    import numpy as np
+
     return "{:.3g}-{:.3g}".format(*np.percentile(values, [10, 90])) if len(values) else ""

@@ -35,13 +35,13 @@ def errors(annotated_root: Path, trained: Path) -> dict[str, str]:
     return dict(map(json.loads, done.stdout.splitlines()))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_a_path_runs_on_a_device_without_data(errors: dict[str, str], name: str) -> None:
     assert errors[name] == ""
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_reading_a_value_and_mixing_devices_are_detected(errors: dict[str, str]) -> None:
     assert errors["a value read on the host"].startswith("DataDependentOutputException")
     assert errors["tensors of two devices"].startswith("FakeTensorDeviceMismatchError")

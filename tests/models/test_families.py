@@ -293,7 +293,7 @@ def test_motions_that_cannot_carry_or_show_another_verb_are_resampled(
     monkeypatch.setattr(VerbCheck, "beyond", lambda self, verb, numbers: next(beyond))
     monkeypatch.setattr(VerbCheck, "fails", lambda self, request, moved_as: moved_as in "yb")
     (answer,) = model.answers([request])
-    assert (answer.draws, len(sampled), left) == (draws, draws, [])
+    assert (answer.attempts, len(sampled), left) == (draws, draws, [])
     assert (answer.carried, answer.clip, answer.moved_as) == (shares[taken], sampled[taken], others[taken])
     for one, other in pairwise(sampled):
         assert abs(joints_of(one) - joints_of(other)).max() > 1e-3

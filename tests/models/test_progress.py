@@ -179,7 +179,7 @@ def test_training_restores_the_state_of_the_process(annotated_root: Path, tmp_pa
     assert torch.equal(torch.get_rng_state(), random_state)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_processes_give_the_weights_of_one_and_write_one_file(annotated_root: Path, out: Path) -> None:
     names = ("contact", "diffusion")
     run_team(train_all, 2, out / "meeting", names, annotated_root, out / "two")

@@ -56,7 +56,7 @@ def off(kind: Any, steps: int) -> float:
     return float(torch.maximum((mean - expected[0]).abs() / expected[1], (spread / expected[1] - 1).abs()).max())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "few", "many"), [("ddim", 10, 250), ("dpm++", 6, 60), ("ddpm", 20, 1000)])
 def test_moments_of_gaussians_are_within_3_percent_and_closer_with_more_steps(kind: str, few: int, many: int) -> None:
     assert off(kind, many) < 0.03

@@ -55,7 +55,7 @@ def test_off_it_writes_the_reason_without_loading_torch(project):
     assert empty_reason(PATHS.evaluators) == "off: params.yaml names no networks under evaluator"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_on_its_metrics_and_digests_are_in_the_metrics_of_a_family(project):
     plans = [("s1", "lift"), ("s1", "open"), ("s2", "lift"), ("s3", "lift"), ("s3", "open")]
     clips = [

@@ -30,16 +30,21 @@ def hoi4d_without_events(root: Path) -> Path:
     return root
 
 
-@pytest.mark.parametrize(("name", "write"), [("arctic", arctic_without_descriptions), ("hoi4d", hoi4d_without_events)])
-def test_a_scan_that_lacks_a_part_names_the_setting_that_makes_it_unnecessary(name: str, write, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "write", "clips"),
+    [("arctic", arctic_without_descriptions, "segments"), ("hoi4d", hoi4d_without_events, "whole")],
+)
+def test_a_scan_that_lacks_a_part_names_the_setting_that_makes_it_unnecessary(
+    name: str, write, clips: str, tmp_path: Path
+) -> None:
     root = write(tmp_path / "raw")
     with pytest.raises(BadInput) as caught:
         _require_parts(get_adapter(name), root)
-    assert f"or set `{name}: {{clips: whole}}` under `convert.adapters` in params.yaml" in caught.value.remedy
-    _require_parts(get_adapter(name, clips="whole"), root)
+    assert f"or set `{name}: {{clips: {clips}}}` under `convert.adapters` in params.yaml" in caught.value.remedy
+    _require_parts(get_adapter(name, clips=clips), root)
     findings = check_adapter(get_adapter(name), root, load_embedded_hands(), sequences=1, worker=False)
     (parts,) = (item for item in findings if "every part" in item.rule)
-    assert parts.detail.endswith("; the setting clips=whole does without it")
+    assert parts.detail.endswith(f"; it is not needed with the setting clips={clips}")
 
 
 def test_a_conversion_that_lacks_events_or_descriptions_names_the_setting_too(tmp_path: Path) -> None:

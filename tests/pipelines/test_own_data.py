@@ -262,7 +262,7 @@ def test_doctor_lists_all_parts(project, project_tools):
         assert part in result.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif("HOIDATA_MANIPNET" not in os.environ, reason="HOIDATA_MANIPNET is not set")
 def test_real_motion_capture_is_scanned_checked_and_converted(project, project_tools):
     root = os.environ["HOIDATA_MANIPNET"]

@@ -138,7 +138,7 @@ def tiny_project(folder: Path, sleep: float = 0.0) -> Path:
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_equals_dvc_repro_and_a_second_run_does_nothing(tmp_path):
     tiny_project(tmp_path)
     run = reproduce_in_parallel([], jobs=2)

@@ -102,7 +102,7 @@ def test_a_stored_result_is_never_unpickled(tmp_path, guarded):
     assert ("no stored result" in done.stdout) is guarded
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_active_runs_are_marked_as_crashed_and_finished_or_scheduled_ones_are_unchanged():
     from prefect import flow
     from prefect.client.orchestration import get_client

@@ -226,8 +226,8 @@ def test_only_recently_used_indices_are_cached(monkeypatch: pytest.MonkeyPatch) 
     assert surface_index(boxes[1]) is not second
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not ROOT, reason="HOIDATA_MANIPNET is not set: the meshes are not part of this repository")
-@pytest.mark.slow
 def test_contact_labels_and_depths_on_manipnet_s_meshes_equal_libigl_s() -> None:
     n_queriesries = 0
     for path in sorted(Path(ROOT).glob("objects/*/*.obj.gz")):

@@ -260,7 +260,7 @@ def test_a_verb_of_one_object_alone_and_an_object_of_one_verb_stay_in_training()
 
 @pytest.mark.parametrize("by", ["composition", "drawn-object"])
 def test_a_corpus_without_crossings_is_refused(by):
-    """A verb per object, as many a recorded set has: nothing can be held_out out that training has in another way."""
+    """A verb per object, as many a recorded set has: nothing can be held out that training has in another way."""
     rows = clips_of([(f"verb {name}", name, "right") for name in OBJECTS] * 6)
     with pytest.raises(
         BadInput, match=rf"split by {by}: expected 3 clips or more .* for test, got 0 of 30.*combined more often"
@@ -271,7 +271,7 @@ def test_a_corpus_without_crossings_is_refused(by):
 def test_fewer_clips_than_the_least_are_refused():
     rows = clips_of(CROSSED)
     assert (assign_split(rows, replace(BY, least_clips=24)) == "test").sum() == 24
-    with pytest.raises(BadInput, match=r"25 clips or more that can be held_out out for test, got 24 of 120"):
+    with pytest.raises(BadInput, match=r"25 clips or more that can be held out for test, got 24 of 120"):
         assign_split(rows, replace(BY, least_clips=25))
     with pytest.raises(BadInput, match="1 clips or more"):
         replace(BY, least_clips=0)

@@ -142,7 +142,7 @@ def test_a_study_corpus_is_the_same_bytes_for_any_number_of_jobs(corpora, tmp_pa
     assert _digests(corpora["arctic"][0]) == _digests(tmp_path / "together")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("dataset", DATASETS)
 def test_a_study_corpus_is_sound_and_its_controls_fail(dataset, corpora):
     sequences = corpora[dataset][1]

@@ -221,7 +221,7 @@ def test_windows_with_an_untracked_hand_are_not_copied(family, sources: Sources,
     assert isinstance(answer, Skipped)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_windows_are_overfitted_to_5_mm(samples: list[ClipSample]) -> None:
     torch.manual_seed(0)
     features = FeatureConfig(

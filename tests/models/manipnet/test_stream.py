@@ -80,7 +80,7 @@ def assert_is_the_clip(poses: list[dict[Side, np.ndarray]], model: Predictor, co
         np.testing.assert_array_equal(np.stack([pose[side] for pose in poses]), whole)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("tracker_hz", "step_hz"), [(50, 60), (50, 30)])
 def test_a_stream_equals_the_clip_bit_for_bit_at_any_tracker_rate(tracker_hz, step_hz):
     model, control = predictor(1 / step_hz), tracked(tracker_hz, 3.0)
