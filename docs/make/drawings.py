@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from hoidata.annotation.sentences import FORMS
 from hoidata.clips.clip import SIDES, HandTrack
 from hoidata.dataset_folders import built_in_names, dataset_facts, dataset_title
 from hoidata.datasets.registry import get_adapter
@@ -165,7 +166,7 @@ def draw_hand_type(figure: Figure, data: Path) -> None:
 
 
 def draw_text_features(figure: Figure, data: Path) -> None:
-    """Plot the cosine similarity of text features: four sentences each of five clips."""
+    """Plot the cosine similarity of text features: the sentences of five clips."""
     annotated = load_annotated(data / "grab", HANDS)
     prompts: dict[tuple, str] = {}
     for clip_id in annotated.ids("test"):
@@ -178,7 +179,8 @@ def draw_text_features(figure: Figure, data: Path) -> None:
     image = axes.imshow(features @ features.T, cmap="YlOrBr", vmin=0, vmax=1)
     axes.set_yticks(range(len(features)), [s for clip_id in chosen for s in annotated.sentences(clip_id)], fontsize=7)
     axes.set_xticks([])
-    for edge in range(4, len(features), 4):
+    forms = len(FORMS)
+    for edge in range(forms, len(features), forms):
         axes.axhline(edge - 0.5, color="white", linewidth=1.5)
         axes.axvline(edge - 0.5, color="white", linewidth=1.5)
     figure.colorbar(image, ax=axes, shrink=0.7, label="cosine of their features")

@@ -64,7 +64,7 @@ def evaluate(
     results = evaluate_store(
         store, reference, hands, split=split, metrics=chosen_metrics, encoders=encoders, jobs=jobs(), progress=True
     )
-    Console(width=None if sys.stdout.isatty() else 120).print(printed_table(results))
+    Console(width=None if sys.stdout.isatty() else 140).print(printed_table(results))
     for line in unmeasured_lines(results):
         typer.echo(line)
     for item in results["left_out"]:

@@ -7,7 +7,7 @@ import pytest
 
 from hoidata.annotation.encoders import load_encoder
 from hoidata.annotation.hand_choice import HAND_TYPES
-from hoidata.annotation.sentences import english_sentences, reference_sentences
+from hoidata.annotation.sentences import FORMS, english_sentences, reference_sentences
 from hoidata.errors import BadInput
 from models.common.vocabulary import Vocabulary
 from models.text2hoi.wording import Wording, edit_distance, understood_words
@@ -75,7 +75,7 @@ def test_ambiguous_words_are_refused_with_suggestions(text: str, expected: str) 
     assert (forced.text, forced.notes) == (text, ())
 
 
-@pytest.mark.parametrize("form", range(4), ids=["imperative", "passive", "subject", "gerund"])
+@pytest.mark.parametrize("form", range(len(FORMS)), ids=[*FORMS])
 @pytest.mark.parametrize(("synonym", "verb"), SYNONYMS)
 def test_a_synonym_becomes_the_training_verb_in_the_same_form(synonym: str, verb: str, form: int) -> None:
     wording = understood(english_sentences(synonym, "mug", "left")[form])
