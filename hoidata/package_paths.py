@@ -44,7 +44,7 @@ def package_home(package: str, project: Path) -> Path:
 
 
 def python_path() -> dict[str, str]:
-    """PYTHONPATH with which a child process finds ``models`` and ``pipelines``; empty in a clone, which needs none."""
-    if not IS_INSTALLED:
+    """PYTHONPATH with which a child process finds ``models`` and ``pipelines``; empty in the folder of a clone."""
+    if not IS_INSTALLED and Path.cwd() == FOLDER:
         return {}
     return {"PYTHONPATH": os.pathsep.join(filter(None, (str(FOLDER), os.environ.get("PYTHONPATH"))))}

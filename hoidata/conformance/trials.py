@@ -123,12 +123,12 @@ class Trials:
         _damage(_one_file(copy, own_files[0]), "cut in half")
         return self._unchanged(rule, copy, others[:1], own_files[:1])
 
-    def _unchanged(self, rule: str, copy: Path, items: list[Loaded], touched: list[str]) -> Finding:
+    def _unchanged(self, rule: str, copy: Path, items: list[Loaded], changed_files: list[str]) -> Finding:
         """Compare with the first load. Clips that name a changed file as source may differ, except in their ids."""
         problems = []
         for item in items:
             reloaded = load_recorded(self.adapter, copy, item.key, self.hands)
-            depends = set(item.needed) & set(touched)
+            depends = set(item.needed) & set(changed_files)
             if (
                 depends
                 and not reloaded.error

@@ -87,7 +87,7 @@ def _hand(side: str) -> tuple[Field, ...]:
     )
 
 
-def _object(prefix: str, rows: str, target: str) -> tuple[Field, ...]:
+def _object_fields(prefix: str, rows: str, target: str) -> tuple[Field, ...]:
     hinge = f"unwrapped hinge angle of {target}; 0 for rigid ones"
     return (
         _rotvec(f"{prefix}_rotvec", rows, f"world_from_object of {target}, column vectors"),
@@ -104,8 +104,8 @@ FRAMES = StoreFile(
         Field("source_frames", "int32", "index in the source file, from 0, rising", shape=("frame",)),
         *_hand("left"),
         *_hand("right"),
-        *_object("object", "frame", "the manipulated object"),
-        *_object("other", "other object x frame", "the further objects, one after another"),
+        *_object_fields("object", "frame", "the manipulated object"),
+        *_object_fields("other", "other object x frame", "the further objects, one after another"),
         _rotvec("camera_rotvec", "camera row", "world_from_camera, OpenCV axes (x right, y down, z ahead)"),
         _point("camera_position_m", "camera row", "position of the camera"),
         Field("camera_images", "int32", "number of the image in the source", shape=("camera row",)),

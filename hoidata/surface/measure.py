@@ -12,7 +12,7 @@ from hoidata.surface.bimart_maps import bimart_map
 from hoidata.surface.contact import deepest_m, hand_in_object_frame, touched_vertices
 
 
-class SideSurface(NamedTuple):
+class HandSurfaceMeasures(NamedTuple):
     """Measures of one hand in each frame."""
 
     touched: np.ndarray  # (frame, 778) bool, vertices closer than 5 mm to the surface; False without the hand
@@ -21,7 +21,7 @@ class SideSurface(NamedTuple):
     map_m: np.ndarray  # (frame, point) BimArt's map; infinite without the hand and beyond 20 cm
 
 
-def measure_hand(clip: Clip, side: Side, hands: HandPair, points: SampledPoints) -> SideSurface:
+def measure_hand(clip: Clip, side: Side, hands: HandPair, points: SampledPoints) -> HandSurfaceMeasures:
     """Measure one hand of a clip against its object's surface.
 
     Args:
@@ -36,7 +36,7 @@ def measure_hand(clip: Clip, side: Side, hands: HandPair, points: SampledPoints)
     index, hand = surface_index(clip.object.model), hand_in_object_frame(clip, side, hands)
     joints_m = track_joints(clip.hands[side], hands[side]).astype(np.float64)
     joints_m = (clip.object.world_from_object.inverse() @ joints_m)[hand.frames]
-    return SideSurface(
+    return HandSurfaceMeasures(
         touched=touched_vertices(hand, index),
         depth_m=deepest_m(hand, index) if index.is_solid else np.full(clip.n_frames, np.nan),
         joint_m=hand.expand_to_clip(index.distance_m(joints_m, hand.hinge_rad).min(axis=1), np.inf),

@@ -19,7 +19,7 @@ from hoidata.quality.thresholds import CLIP_MEASURES
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.hand_evidence import HandEvidence
 from hoidata.store.info import embedded_hand_warning
-from hoidata.surface.measure import SideSurface, measure_hand
+from hoidata.surface.measure import HandSurfaceMeasures, measure_hand
 from pipelines.pages.quality import read_limits
 
 Rows = list[tuple[str, ...]]
@@ -32,7 +32,7 @@ class ClipSeries:
 
     touched: dict[Side, np.ndarray]  # per side (frame, point) bool, the contact map of each frame
     evidence: HandEvidence  # distances that decide the hand type
-    surface: dict[Side, SideSurface]  # per side, distances to the exact surface
+    surface: dict[Side, HandSurfaceMeasures]  # per side, distances to the exact surface
     solid: bool  # the object is a closed solid, so depth is defined
     speed_m_s: np.ndarray  # of the object
     lift_m: np.ndarray | None  # height of the object above its first frame; None without gravity
