@@ -22,9 +22,11 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(VENV)/bin/pip install --quiet -c constraints.txt -e .
 	touch $@
 
-$(VENV)/.installed-dev: $(VENV)/.installed
+# One call for all packages: two would resolve them twice.
+$(VENV)/.installed-dev: pyproject.toml constraints.txt
+	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/pip install --quiet -c constraints.txt -e '.[test,dev,docs]'
-	touch $@
+	touch $(VENV)/.installed $@
 
 # The documentation as a site in build/site; strict: no dead link, nothing left out.
 docs: install-dev

@@ -85,7 +85,7 @@ def test_lineage_rerun_trains_the_same_weights_in_a_clean_clone(built, project_t
         assert project_tools.run(built, "git", *identity, *words).returncode == 0
     try:
         result = project_tools.run(built, "hoidata", "lineage", "rerun", "checkpoints/embedded/grab/length")
-        assert result.stdout.endswith("\nsame\n"), result.stdout + result.stderr
+        assert result.stdout.endswith("\nsame weights\n"), result.stdout + result.stderr
     finally:
         assert project_tools.run(built, "git", "update-ref", "-d", "HEAD").returncode == 0
 
