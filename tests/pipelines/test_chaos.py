@@ -133,6 +133,7 @@ def moment(repetition: int, least: float, most: float) -> float:
     return random.Random(repetition).uniform(least, most)
 
 
+@pytest.mark.long
 @repeated
 @pytest.mark.parametrize("damage", ["absent", "changed", "one gone"] if IS_CHAOS else ["one gone"])
 def test_absent_or_changed_raw_files_stop_a_conversion(built, typed, repetition, damage):
@@ -189,6 +190,7 @@ def test_a_killed_worker_does_not_change_the_result(built, begun, repetition):
     assert process.wait(120) == 0, process.output.read_text()  # pyright: ignore
 
 
+@pytest.mark.long
 @repeated
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL] if IS_CHAOS else [signal.SIGINT])
 def test_the_stages_of_an_interrupted_or_killed_run_end_with_it(built, typed, begun, repetition, sent):

@@ -24,7 +24,7 @@ def test_examples_are_short_and_every_one_is_run():
     assert all(len(lines) <= 40 for lines in lines_by_file.values())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_an_example_runs(name, built, monkeypatch, capsys):
     monkeypatch.chdir(built)

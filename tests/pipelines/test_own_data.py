@@ -69,7 +69,7 @@ def test_repro_refuses_before_dvc_starts(project, project_tools, monkeypatch):
     assert "Running stage" not in result.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_mano_files_are_registered_with_digest_and_folder(project, tmp_path, project_tools):
     mano = tmp_path / "mano"
     mano.mkdir()
@@ -87,7 +87,7 @@ def test_mano_files_are_registered_with_digest_and_folder(project, tmp_path, pro
     assert changed_files(project, project_tools) == {f"?? manifests/own/{name}.json" for name in names}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_git_shows_the_chosen_profile_and_new_manifests_and_dvc_builds_the_profile_own(
     project, small_corpus, project_tools
 ):

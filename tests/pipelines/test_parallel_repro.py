@@ -182,7 +182,7 @@ def test_a_stage_process_that_has_no_group_yet_or_has_ended_is_stopped_without_a
     _signal_group(just_started.pid, number)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
 def test_stopping_a_run_stops_its_stages_and_the_next_run_completes(tmp_path, sent):
     tiny_project(tmp_path, sleep=20)

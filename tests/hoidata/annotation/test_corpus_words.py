@@ -30,6 +30,7 @@ def by_clip(sequences: list[TruthSequence], clips: Path) -> dict[str, TruthSeque
     return {entry.clip_id: truths[entry.sequence, entry.first_source_frame] for entry in rows.itertuples()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dataset", ["h2o", "grab", "arctic"])
 def test_the_known_hand_is_found_and_every_sentence_names_it_alone(dataset: str, small_corpus, tmp_path: Path) -> None:
     corpus = small_corpus(dataset)
