@@ -58,7 +58,7 @@ def compare_corpora(statistics: Mapping[str, np.ndarray], reference: Mapping[str
         is_known = len(values) > 0 and len(others) > 0
         ratio = float(values.mean() / others.mean()) if is_known and others.mean() else float("nan")
         distance = float(np.asarray(ks_2samp(values, others))[0]) if is_known else float("nan")
-        rows.append(Comparison(name, unit, values, others, ratio, distance))
+        rows.append(Comparison(name, unit, values=values, reference=others, ratio=ratio, distance=distance))
     return rows
 
 
