@@ -19,13 +19,13 @@ install-dev: $(VENV)/.installed-dev
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install --quiet --no-compile -c constraints.txt -e .
+	$(VENV)/bin/pip install --quiet -c constraints.txt -e .
 	touch $@
 
-# One call for all packages: two would resolve them twice. --no-compile: modules are compiled when they are imported.
+# One call for all packages: two would resolve them twice.
 $(VENV)/.installed-dev: pyproject.toml constraints.txt
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install --quiet --no-compile -c constraints.txt -e '.[test,dev,docs]'
+	$(VENV)/bin/pip install --quiet -c constraints.txt -e '.[test,dev,docs]'
 	touch $(VENV)/.installed $@
 
 # The documentation as a site in build/site; strict: no dead link, nothing left out.
