@@ -16,8 +16,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-CEILING = 256  # hits in all tracked files
-ALLOWED: frozenset[str] = frozenset()
+CEILING = 248  # hits in all tracked files
+ALLOWED = frozenset({"promises"})
 
 # Patterns of prose and the standard terms to use instead.
 PHRASES = {

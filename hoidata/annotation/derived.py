@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from hoidata.clips import FPS, SIDES, Clip
-from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.geometry.rotations import rotation_angle, rotvec_to_rotmat
 from hoidata.store.hand_evidence import HandEvidence
 
 # All thresholds are ours. A smaller hinge rotation can be a side effect of the grasp.
@@ -103,7 +103,7 @@ def object_motion(clip: Clip, evidence: HandEvidence) -> ObjectMotion:
     height_m = None if up is None else shift_m @ up
     travel_m = shift_m if up is None or height_m is None else shift_m - np.maximum(height_m, 0)[:, None] * up
     shakes, shaken = _shakes(centre_m)
-    turned_rad = float(_angles(rotation[0].T @ rotation).max())
+    turned_rad = float(rotation_angle(rotation[0].T @ rotation).max())
     hinge_range_rad = 0.0 if track.hinge_rad is None else float(np.ptp(track.hinge_rad))
     touched = np.any([evidence.near(side) for side in SIDES], axis=0)
     return ObjectMotion(
@@ -159,8 +159,3 @@ def turning_points(signal: np.ndarray, least: float) -> list[int]:
             reversals.append(low)
             rising, high = True, frame
     return reversals
-
-
-def _angles(rotation: np.ndarray) -> np.ndarray:
-    """Return the (frame,) angles of rotation matrices (frame, 3, 3), radians."""
-    return np.arccos(np.clip((np.trace(rotation, axis1=1, axis2=2) - 1) / 2, -1, 1))

@@ -11,13 +11,14 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
+from hoidata.actions.action import object_middle_m
 from hoidata.annotation.derived import turning_points
 from hoidata.clips.clip import FPS, SIDES, Clip, Side
 from hoidata.contact.maps import find_active_hands
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.contact.settings import ContactSettings
 from hoidata.geometry.intervals import Interval, bridged, runs
-from hoidata.geometry.rotations import rotation_angle, rotvec_to_rotmat
+from hoidata.geometry.rotations import rotation_angle
 from hoidata.hands import HandPair, track_joints
 from hoidata.objects.sampling import sample_points
 from hoidata.store.hand_evidence import HandEvidence
@@ -143,15 +144,14 @@ def _divided(cuts: list[Cut], speed_m: np.ndarray) -> list[Cut]:
 
 
 def object_signals(recording: Clip) -> ObjectSignals:
-    """What the object does in each frame: the middle of its bounding box at hinge angle zero, and its hinge."""
-    track, vertices_m = recording.object, recording.object.model.vertices_m
-    corners_m = np.stack([vertices_m.min(axis=0), vertices_m.max(axis=0)])
-    rotation = rotvec_to_rotmat(track.rotvec.astype(np.float64))
-    centre_m = rotation @ corners_m.mean(axis=0) + track.translation_m.astype(np.float64)
+    """What the object does in each frame: the centre of its base part, its rotation and its hinge."""
+    track = recording.object
+    rotation, centre_m = track.world_from_object.rotation, object_middle_m(track)
     hinge_rad = None if track.hinge_rad is None else track.hinge_rad.astype(np.float64)
     step_m = np.linalg.norm(np.diff(centre_m, axis=0, prepend=centre_m[:1]), axis=1)
     if hinge_rad is not None:
-        step_m += np.linalg.norm(np.ptp(corners_m, axis=0)) / 2 * np.abs(np.diff(hinge_rad, prepend=hinge_rad[0]))
+        radius_m = np.linalg.norm(np.ptp(track.model.vertices_m, axis=0)) / 2
+        step_m += radius_m * np.abs(np.diff(hinge_rad, prepend=hinge_rad[0]))
     frames, half = np.arange(recording.n_frames), WINDOW_FRAMES // 2
     before, after = np.maximum(frames - half, 0), np.minimum(frames + half, recording.n_frames - 1)
     turned_rad = rotation_angle(rotation[before].transpose(0, 2, 1) @ rotation[after])

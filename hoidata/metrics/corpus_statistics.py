@@ -133,7 +133,7 @@ def _object(clip: Clip, touched: Mapping[Side, np.ndarray]) -> Iterator[tuple[st
     jerk = np.linalg.norm(np.diff(middle_m, n=3, axis=0), axis=-1) * FPS**3
     yield from _means({"object jitter": [jerk], "object speed": [speed[speed > OBJECT_MOVES_CM_S]]})
     if clip.gravity is not None:
-        rotation = rotvec_to_rotmat(clip.object.rotvec.astype(np.float64))
+        rotation = clip.object.world_from_object.rotation
         up = -np.asarray(clip.gravity, np.float64)
         up_in_object = rotation[0].T @ up
         yield "object tilt", float(np.degrees(np.arccos(np.clip(rotation @ up_in_object @ up, -1, 1)).max()))

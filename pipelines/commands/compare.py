@@ -2,15 +2,13 @@
 
 import json
 import sys
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
-from hoidata.errors import MissingResource
-from pipelines.commands.project import enter_project, hands_of
+from pipelines.commands.project import hands_of_dataset
 
 if TYPE_CHECKING:
     import numpy as np
@@ -33,15 +31,9 @@ def compare(
     from hoidata.files import write_whole
     from hoidata.metrics.corpus_statistics import STATISTICS, compare_corpora, corpus_statistics
     from hoidata.store.annotated import load_annotated
-    from hoidata.store.store import read_info
 
-    with suppress(MissingResource):
-        enter_project()  # where the user's MANO files are listed
     values, others = (
-        corpus_statistics(
-            load_annotated(folder, hands_of(read_info(folder / "clips")["hand_model"]["digest"], str(folder))), clips
-        )
-        for folder in (corpus, reference)
+        corpus_statistics(load_annotated(folder, hands_of_dataset(folder)), clips) for folder in (corpus, reference)
     )
     rows = compare_corpora(values, others)
     table = Table(title=f"{corpus} compared with {reference}", box=box.SIMPLE)

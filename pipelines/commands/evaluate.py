@@ -3,20 +3,17 @@
 import json
 import sys
 from collections import Counter
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
-from hoidata.errors import MissingResource
-from pipelines.commands.project import enter_project, hands_of
+from pipelines.commands.project import hands_of_dataset
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from hoidata.hands import HandPair
     from pipelines.expected_orderings import OrderingResult
 
 _FOLDER: Any = {"exists": True, "file_okay": False, "resolve_path": True}
@@ -60,7 +57,7 @@ def evaluate(
         from models.evaluator.encoders import load_evaluators
 
         encoders = load_evaluators(evaluators)
-    hands, chosen_metrics = _hands(reference), select_metrics(filter(None, metrics.split(",")))
+    hands, chosen_metrics = hands_of_dataset(reference), select_metrics(filter(None, metrics.split(",")))
     results = evaluate_store(
         store, reference, hands, split=split, metrics=chosen_metrics, encoders=encoders, jobs=jobs(), progress=True
     )
@@ -71,15 +68,6 @@ def evaluate(
         typer.echo(f"skipped: {item['clip_id']}: {item['reason']}")
     if out is not None:
         write_whole(out, json.dumps(results, indent=2, sort_keys=True, allow_nan=False) + "\n")
-
-
-def _hands(reference: Path) -> "HandPair":
-    """The hand model the dataset was converted with: the embedded one, or the user's MANO files."""
-    from hoidata.store.store import read_info
-
-    with suppress(MissingResource):
-        enter_project()  # its hoidata.toml names the user's MANO files
-    return hands_of(read_info(reference / "clips")["hand_model"]["digest"], str(reference))
 
 
 def table(

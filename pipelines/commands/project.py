@@ -4,6 +4,7 @@ import json
 import os
 import re
 import tomllib
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -67,6 +68,15 @@ def chosen_hands(choice: str) -> "HandPair":
 
     folder = Path(choice) if choice not in ("", "embedded") else (registered_root(HAND) if not choice else None)
     return load_embedded_hands() if folder is None else load_mano_hands(folder)
+
+
+def hands_of_dataset(folder: Path) -> "HandPair":
+    """The hand model that an annotated dataset was converted with: the embedded one, or the user's MANO files."""
+    from hoidata.store.store import read_info
+
+    with suppress(MissingResource):
+        enter_project()  # its hoidata.toml names the user's MANO files
+    return hands_of(read_info(folder / "clips")["hand_model"]["digest"], str(folder))
 
 
 def hands_of(digest: str, source: str) -> "HandPair":

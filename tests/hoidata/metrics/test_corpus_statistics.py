@@ -1,15 +1,12 @@
 """Statistics of a corpus against motions whose numbers are known, and the comparison of two corpora."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from hoidata.metrics.corpus_statistics import STATISTICS, clip_statistics, compare_corpora, corpus_statistics
+from hoidata.metrics.corpus_statistics import STATISTICS, clip_statistics, compare_corpora
 from hoidata.store.annotated import load_annotated
-from pipelines.cli import app
 from tests.builders.clips import build_clip, with_hand
 from tests.builders.stores import write_annotated
 
@@ -17,7 +14,7 @@ SPLIT = {"by": "subject", "train": "rest", "validation": [], "test": ["s9"]}
 
 
 def statistics(folder, clip) -> dict[str, list[float]]:
-    """All values of one clip, by name."""
+    """All values of one clip per statistic."""
     annotated = load_annotated(write_annotated(folder, [clip], "test", SPLIT, 0.02))
     values: dict[str, list[float]] = {}
     for name, value in clip_statistics(annotated, clip.clip_id):
@@ -66,18 +63,10 @@ def test_a_hinge_worked_by_two_hands_is_measured(tmp_path):
 
 def test_equal_corpora_are_at_distance_0_and_disjoint_ones_at_1():
     values = {name: np.arange(1.0, 5.0) for name in STATISTICS}
-    assert all(row.distance == 0 and row.ratio == 1 for row in compare_corpora(values, values))
+    assert all(comparison.distance == 0 and comparison.ratio == 1 for comparison in compare_corpora(values, values))
     shifted = {name: array + 10 for name, array in values.items()}
-    assert all(row.distance == 1 for row in compare_corpora(values, shifted))
+    assert all(comparison.distance == 1 for comparison in compare_corpora(values, shifted))
     nothing = {name: np.zeros(0) for name in STATISTICS}
-    assert all(np.isnan(row.distance) and np.isnan(row.ratio) for row in compare_corpora(values, nothing))
-
-
-def test_the_command_prints_every_statistic_and_writes_the_values(tmp_path):
-    folder = write_annotated(tmp_path / "a", [build_clip(n_frames=40)], "test", SPLIT, 0.02)
-    done = CliRunner().invoke(app, ["compare", str(folder), str(folder), "--out", str(tmp_path / "out.json")])
-    assert done.exit_code == 0, done.output
-    assert all(name in done.output for name in STATISTICS)
-    assert "not measured" in done.output  # a rigid object has no hinge
-    written = json.loads((tmp_path / "out.json").read_text())
-    assert written["grasp duration"]["values"] == corpus_statistics(load_annotated(folder))["grasp duration"].tolist()
+    assert all(
+        np.isnan(comparison.distance) and np.isnan(comparison.ratio) for comparison in compare_corpora(values, nothing)
+    )
