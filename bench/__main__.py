@@ -1,4 +1,4 @@
-"""``python -m bench [NAME ...]``: the benchmarks named (see ``BENCHMARKS``), or all but ``bimart-tables``.
+"""``python -m bench [NAME ...]``: the benchmarks named (see ``BENCHMARKS``), or all but those ``ON_REQUEST``.
 
 Every result stands next to a named baseline of the same run; variants take turns and medians of several runs are shown.
 Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder with the embedded raw corpora.
@@ -6,7 +6,7 @@ Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder with the e
 
 import sys
 
-from bench import adapters, bimart, bimart_tables, kernels, samplers, scale
+from bench import adapters, bimart, bimart_tables, kernels, recordings, samplers, scale
 
 BENCHMARKS = {
     "adapters": adapters.main,
@@ -15,8 +15,9 @@ BENCHMARKS = {
     "bimart": bimart.main,
     "samplers": samplers.main,
     "bimart-tables": bimart_tables.main,
+    "recordings": recordings.main,
 }
-ON_REQUEST = ("bimart-tables",)  # it needs an annotated dataset and trains for hours
+ON_REQUEST = ("bimart-tables", "recordings")  # they need data, and train for hours
 
 
 def main() -> int:
