@@ -102,6 +102,7 @@ def main() -> None:
         f"## {title}\n\n{markdown_table(measured, columns, methods)}\n\n{unmeasured(measured, columns, methods)}"
         for title, (columns, methods) in TABLES.items()
     )
+    text += f"\n\n## Time and memory of each stage\n\n{stage_table(project)}"
     (project / "benchmark.md").write_text(text + "\n")
     print(text)
 
@@ -156,3 +157,12 @@ def unmeasured(
                 words = f"no value for {share:.0%} of the clips ({reasons_in_words(reasons)})"
                 lines.append(f"- {title}, {method}: {words}")
     return "\n".join(lines)
+
+
+def stage_table(project: Path) -> str:
+    """A Markdown table: per stage of the project the wall time and processor time, seconds, the peak memory."""
+    rows = ["| stage | wall, s | processor, s | memory, MiB |", "|---|---|---|---|"]
+    runs = [json.loads(path.read_text()) for path in (project / ".hoidata/runs").glob("*.json")]
+    for run in sorted(runs, key=lambda run: run["began_at"]):
+        rows.append(f"| {run['stage']} | {run['seconds']:.0f} | {run['processor_seconds']:.0f} | {run['peak_mib']} |")
+    return "\n".join(rows)

@@ -64,8 +64,12 @@ def evaluate(
     Console(width=None if sys.stdout.isatty() else 140).print(printed_table(results))
     for line in unmeasured_lines(results):
         typer.echo(line)
+    skipped: dict[str, list[str]] = {}
     for item in results["left_out"]:
-        typer.echo(f"skipped: {item['clip_id']}: {item['reason']}")
+        skipped.setdefault(item["reason"], []).append(item["clip_id"])
+    for reason, clips in skipped.items():
+        others = f" and {len(clips) - 1:,} more" if len(clips) > 1 else ""
+        typer.echo(f"skipped: {clips[0]}{others}: {reason}")
     if out is not None:
         write_whole(out, json.dumps(results, indent=2, sort_keys=True, allow_nan=False) + "\n")
 

@@ -141,3 +141,12 @@ def test_a_store_written_by_the_ten_line_script_of_the_docs_is_measured_by_the_c
     assert evaluation["figures"]["joint_error_mm"] == pytest.approx(10.0, abs=0.01)
     assert evaluation["motions"] == 4
     assert evaluation["figures"]["bimart_accel_paper"] > 0
+
+
+def test_motions_skipped_for_one_reason_are_printed_in_one_line(clips):
+    done = CliRunner().invoke(app, ["evaluate", str(PATHS.clips), "--reference", str(PATHS.data)])
+    lines = [line for line in done.output.splitlines() if line.startswith("skipped: ")]
+    recorded = load_annotated(PATHS.data)
+    others = len(recorded.ids()) - len(recorded.ids("test"))
+    assert len(lines) == 1
+    assert f" and {others - 1} more: no clip of this part of the split is its reference" in lines[0]
