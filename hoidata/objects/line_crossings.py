@@ -13,6 +13,7 @@ from numba import njit
 from hoidata.objects.triangle_tree import DEEPEST, TriangleTree
 
 OUTSIDE, INSIDE, UNSURE = 0, 1, 2
+ROUNDING_M = 1e-9  # more than the rounding of a crossing's x
 
 
 class Intervals(NamedTuple):
@@ -47,7 +48,7 @@ def settle_sides(tree, points_m, side):  # pragma: no cover (compiled)
     for point in range(len(points_m)):
         if side[point] == UNSURE:
             x, y, z = points_m[point, 0], points_m[point, 1], points_m[point, 2]
-            count = _crossings(box, link, corner, vertices_m, y, z, stack, crossings_m, signs)
+            count = _crossings(box, link, corner, vertices_m, x, y, z, stack, crossings_m, signs)
             side[point] = INSIDE if _winding(crossings_m, signs, count, x) > 0 else OUTSIDE
 
 
@@ -59,7 +60,7 @@ def negate_inside(tree, low_m, cell_m, value):  # pragma: no cover (compiled)
     for k in range(value.shape[0]):
         for j in range(value.shape[1]):
             y, z = low_m[1] + j * cell_m, low_m[2] + k * cell_m
-            count = _crossings(box, link, corner, vertices_m, y, z, stack, crossings_m, signs)
+            count = _crossings(box, link, corner, vertices_m, low_m[0], y, z, stack, crossings_m, signs)
             for i in range(value.shape[2]):
                 if _winding(crossings_m, signs, count, low_m[0] + i * cell_m) > 0:
                     value[k, j, i] = -value[k, j, i]
@@ -74,9 +75,10 @@ def _winding(crossings_m, signs, count, x):  # pragma: no cover (compiled)
 
 
 @njit(cache=True)
-def _crossings(box, link, corner, vertices_m, y, z, stack, crossings_m, signs):  # pragma: no cover (compiled)
+def _crossings(box, link, corner, vertices_m, from_x, y, z, stack, crossings_m, signs):  # pragma: no cover (compiled)
     """Intersect the line along x through (y, z) with the triangles. Returns the number of crossings.
 
+    Crossings well below ``from_x`` may be missing.
     ``crossings_m`` receives the x of each crossing, ``signs`` +1 if the line leaves the solid there (outward normal
     along +x) and -1 if it enters. A line through an edge or a corner counts as shifted by an infinitesimal step to +y
     and a smaller one to +z, so that every line leaves a closed surface as often as it enters.
@@ -86,7 +88,13 @@ def _crossings(box, link, corner, vertices_m, y, z, stack, crossings_m, signs): 
     while size:
         size -= 1
         node = stack[size]
-        if y < box[node, 1] or y > box[node, 4] or z < box[node, 2] or z > box[node, 5]:
+        if (
+            box[node, 3] < from_x - ROUNDING_M
+            or y < box[node, 1]
+            or y > box[node, 4]
+            or z < box[node, 2]
+            or z > box[node, 5]
+        ):
             continue
         second = link[node, 0]
         if second:

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from hoidata.clips.clip import FPS
 
@@ -79,14 +78,14 @@ def _nearest(
     joints_m: np.ndarray, points_m: np.ndarray, frames: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return frame, joint and point of the closest pair, for frames in which they are within 5 cm."""
-    pairs = []
-    for frame in frames:
-        distance, point = map(np.asarray, KDTree(points_m[frame]).query(joints_m[frame], distance_upper_bound=NEAR_M))
-        joint = int(distance.argmin())
-        if np.isfinite(distance[joint]):
-            pairs.append((frame, joint, int(point[joint])))
-    columns = np.array(pairs, dtype=np.int64).reshape(-1, 3).T
-    return columns[0], columns[1], columns[2]
+    rows = np.asarray(frames, dtype=np.int64)
+    offsets_m = joints_m[rows, :, None] - points_m[rows, None]  # (frame, joint, point, 3)
+    squared_m2 = np.einsum("fjpi,fjpi->fjp", offsets_m, offsets_m).reshape(
+        len(rows), joints_m.shape[1] * points_m.shape[1]
+    )
+    pair = squared_m2.argmin(axis=1)
+    near = squared_m2[np.arange(len(rows)), pair] < NEAR_M**2
+    return rows[near], *np.divmod(pair[near], points_m.shape[1])
 
 
 def _carried_velocity(motion: ObjectMotion, part: np.ndarray, frame: np.ndarray, positions_m: np.ndarray) -> np.ndarray:
