@@ -132,7 +132,7 @@ def markdown_table(
         if family in measured:
             cells = [_cell(measured[family], metric) for metric in columns.values()]
         rows.append([title, *cells])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
 
 
 def _cell(result: Mapping[str, Any], metric: str) -> str:
@@ -153,8 +153,8 @@ def unmeasured(
     for title, metric in columns.items():
         for method, family in methods.items():
             if reasons := measured.get(family, {}).get("unmeasured", {}).get(metric):
-                share = sum(reasons.values()) / measured[family]["held_out_clips"]
-                words = f"no value for {share:.0%} of the clips ({reasons_in_words(reasons)})"
+                unmeasured_fraction = sum(reasons.values()) / measured[family]["held_out_clips"]
+                words = f"no value for {unmeasured_fraction:.0%} of the clips ({reasons_in_words(reasons)})"
                 lines.append(f"- {title}, {method}: {words}")
     return "\n".join(lines)
 

@@ -31,8 +31,8 @@ def test_the_benchmark_samples_every_method_of_its_tables():
 
 
 def test_the_metrics_of_the_tables_exist():
-    known = {metric.name for metric in (*METRICS, *BIMART_METRICS)}
-    assert {name for columns, _ in TABLES.values() for name in columns.values()} <= known
+    registered = {metric.name for metric in (*METRICS, *BIMART_METRICS)}
+    assert {name for columns, _ in TABLES.values() for name in columns.values()} <= registered
 
 
 def test_a_table_shows_the_interval_and_the_number_of_clips_if_some_are_missing():

@@ -151,7 +151,7 @@ def _intervals(tree, low_m, cell_m, shape):  # pragma: no cover (compiled)
     for j in range(shape[0]):
         for k in range(shape[1]):
             y, z = low_m[0] + (j + 0.5) * cell_m, low_m[1] + (k + 0.5) * cell_m
-            count = _crossings(box, link, corner, vertices_m, y, z, stack, crossings_m, signs)
+            count = _crossings(box, link, corner, vertices_m, -np.inf, y, z, stack, crossings_m, signs)
             _sort(crossings_m, signs, count)
             winding = 0.0
             for number in range(count):
