@@ -1,52 +1,37 @@
-"""The benchmark on real recordings: its settings fit its tables, and a table hides no missing value."""
+"""The settings of the benchmark on real recordings fit a project, and its metrics exist."""
 
-from bench.recordings import SETTINGS, TABLES, markdown_table, unmeasured
-from hoidata.metrics.optional_metrics import BIMART_METRICS
-from hoidata.metrics.registry import METRICS
+from bench.recordings import SETTINGS, TABLES, merge_params, stage_table
 from hoidata.package_paths import FOLDER
 from hoidata.settings import merge_settings
 from models.registry import load_family
-from pipelines.params import load_yaml
-from pipelines.stages.families import OPTIONAL_FAMILIES
+from pipelines.pages.metrics_table import ALL_METRICS
+from pipelines.params import load_yaml, read_params
 
 
-def _result(value, clips, reasons=None):
-    return {
-        "held_out_clips": 4,
-        "figures": {"contact_f1": value},
-        "intervals": {"contact_f1": {"clips": [0.25, 0.75]}},
-        "counts": {"contact_f1": {"clips": clips}},
-        "unmeasured": {"contact_f1": reasons or {}},
-    }
+def test_merged_settings_are_those_of_the_chosen_profile_and_a_second_merge_changes_nothing(tmp_path):
+    path = tmp_path / "params.yaml"
+    path.write_bytes((FOLDER / "params.yaml").read_bytes())
+    merge_params(path)
+    once, params, settings = path.read_bytes(), read_params(tmp_path), load_yaml(SETTINGS.read_bytes())
+    merge_params(path)
+    assert path.read_bytes() == once
+    assert params["profile"] == "own"
+    for section in ("split", "sample", "train", "controls", "evaluate"):
+        assert merge_settings(params[section], settings[section]) == params[section]
 
 
-def test_the_benchmark_samples_every_method_of_its_tables():
-    params = merge_settings(load_yaml((FOLDER / "params.yaml").read_bytes()), load_yaml(SETTINGS.read_bytes()))
-    sampled = {*params["families"], *params["controls"]["families"], *params["family_datasets"], "bimart-unrefined"}
-    sampled |= {"nearest-window", "mean-pose-at-object"}  # stages of models/bimart/dvc.yaml
-    names = {name for _, methods in TABLES.values() for name in methods.values()}
-    assert names <= sampled
-    assert all(load_family(name).name == name for name in names)
-    assert set(params["family_datasets"]) == set(OPTIONAL_FAMILIES)
+def test_every_control_is_a_family_and_every_metric_exists():
+    settings = load_yaml(SETTINGS.read_bytes())
+    assert all(load_family(name).name == name for name in settings["controls"]["families"])
+    assert {name for names in TABLES.values() for name in names.split()} <= {metric.name for metric in ALL_METRICS}
 
 
-def test_the_metrics_of_the_tables_exist():
-    registered = {metric.name for metric in (*METRICS, *BIMART_METRICS)}
-    assert {name for columns, _ in TABLES.values() for name in columns.values()} <= registered
-
-
-def test_a_table_shows_the_interval_and_the_number_of_clips_if_some_are_missing():
-    measured = {"a": _result(0.5, 4), "b": _result(0.5, 3, {"no hinge": 1}), "c": _result(None, 0, {"no hinge": 4})}
-    table = markdown_table(measured, {"F1": "contact_f1"}, {"A": "a", "B": "b", "C": "c", "absent": "d"})
-    assert table.splitlines()[2:] == [
-        "| A | 0.5 (0.25 to 0.75) |",
-        "| B | 0.5 (0.25 to 0.75) n=3 |",
-        "| C | – |",
-        "| absent | not measured |",
-    ]
-
-
-def test_missing_values_are_listed_with_share_and_reason():
-    measured = {"a": _result(0.5, 4), "b": _result(0.5, 3, {"no hinge": 1})}
-    lines = unmeasured(measured, {"F1": "contact_f1"}, {"A": "a", "B": "b"})
-    assert lines == "- F1, B: no value for 25% of the clips (no hinge: 1 clip)"
+def test_stages_are_listed_in_the_order_in_which_they_ran(tmp_path):
+    runs = tmp_path / ".hoidata/runs"
+    runs.mkdir(parents=True)
+    for stage, began_at in (("split", "2026-01-01T10:00:00"), ("convert", "2026-01-01T09:00:00")):
+        run = (
+            f'{{"stage": "{stage}", "began_at": "{began_at}", "seconds": 2.4, "processor_seconds": 3.6, "peak_mib": 5}}'
+        )
+        (runs / f"{stage}.json").write_text(run)
+    assert stage_table(tmp_path).splitlines()[2:] == ["| convert | 2 | 4 | 5 |", "| split | 2 | 4 | 5 |"]

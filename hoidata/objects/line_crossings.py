@@ -78,7 +78,7 @@ def _winding(crossings_m, signs, count, x):  # pragma: no cover (compiled)
 def _crossings(box, link, corner, vertices_m, from_x, y, z, stack, crossings_m, signs):  # pragma: no cover (compiled)
     """Intersect the line along x through (y, z) with the triangles. Returns the number of crossings.
 
-    Crossings well below ``from_x`` may be missing.
+    Boxes of triangles below ``from_x`` are skipped, so crossings there may be missing; -inf gives all crossings.
     ``crossings_m`` receives the x of each crossing, ``signs`` +1 if the line leaves the solid there (outward normal
     along +x) and -1 if it enters. A line through an edge or a corner counts as shifted by an infinitesimal step to +y
     and a smaller one to +z, so that every line leaves a closed surface as often as it enters.

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from hoidata.clips.clip import FPS
 
@@ -78,14 +79,14 @@ def _nearest(
     joints_m: np.ndarray, points_m: np.ndarray, frames: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return frame, joint and point of the closest pair, for frames in which they are within 5 cm."""
-    rows = np.asarray(frames, dtype=np.int64)
-    offsets_m = joints_m[rows, :, None] - points_m[rows, None]  # (frame, joint, point, 3)
-    squared_m2 = np.einsum("fjpi,fjpi->fjp", offsets_m, offsets_m).reshape(
-        len(rows), joints_m.shape[1] * points_m.shape[1]
-    )
-    pair = squared_m2.argmin(axis=1)
-    near = squared_m2[np.arange(len(rows)), pair] < NEAR_M**2
-    return rows[near], *np.divmod(pair[near], points_m.shape[1])
+    pairs = []
+    for frame in frames:
+        distances_m = cdist(joints_m[frame], points_m[frame])
+        joint, point = np.unravel_index(distances_m.argmin(), distances_m.shape)
+        if distances_m[joint, point] < NEAR_M:
+            pairs.append((frame, joint, point))
+    columns = np.array(pairs, dtype=np.int64).reshape(-1, 3).T
+    return columns[0], columns[1], columns[2]
 
 
 def _carried_velocity(motion: ObjectMotion, part: np.ndarray, frame: np.ndarray, positions_m: np.ndarray) -> np.ndarray:

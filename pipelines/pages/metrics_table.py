@@ -176,8 +176,8 @@ def _of_topic(title: str, metrics: list[AnyMetric]) -> list[AnyMetric]:
 def markdown_table(folder: str | Path, families: Sequence[str], names: Sequence[str]) -> str:
     """The metrics ``names`` of every evaluated method as a Markdown table.
 
-    Cells that are worse than a retrieval baseline say so. Reasons of methods that were not evaluated and of unmeasured
-    metrics follow below the table. Raises BadInput for an unknown metric.
+    A cell has its 95 % interval over clips, and says if it is worse than a retrieval baseline. Reasons of methods that
+    were not evaluated and of unmeasured metrics follow below the table. Raises BadInput for an unknown metric.
     """
     files, by_name = _read_files(Path(folder), families), {metric.name: metric for metric in ALL_METRICS}
     if unknown := [name for name in names if name not in by_name]:
@@ -197,8 +197,10 @@ def markdown_table(folder: str | Path, families: Sequence[str], names: Sequence[
 
 
 def _marked(cell: Cell, kind: str) -> str:
-    text = f"{cell.text} ({cell.coverage} clips)" if cell.coverage else cell.text
-    return f"{text} (worse than retrieval)" if cell.mark == "bad" and kind == "family" else text
+    is_worse = cell.mark == "bad" and kind == "family"
+    remarks = [cell.spread, cell.coverage and f"{cell.coverage} clips", "worse than retrieval" if is_worse else ""]
+    words = "; ".join(filter(None, remarks))
+    return f"{cell.text} ({words})" if words else cell.text
 
 
 def _reasons(metric: AnyMetric, files: _Files) -> str:

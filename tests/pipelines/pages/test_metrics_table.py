@@ -159,7 +159,7 @@ def test_markdown_marks_values_worse_than_retrieval(folder):
     lines = markdown_table(folder, FAMILIES, ["joint_error_mm", "contact_f1"]).splitlines()
     assert lines[0].startswith("| method | joint error of the best sample, mm (lower is better) |")
     assert lines[2:] == [
-        "| ours | 30.0 | 0.500 (worse than retrieval) |", "| nearest-clip | 40.0 | 0.600 |",
+        "| ours | 30.0 | 0.500 (0.400 to 0.700; worse than retrieval) |", "| nearest-clip | 40.0 | 0.600 |",
         "| ground-truth | 0.00 | 1.00 |", "| static | - | 0.200 |", "",
         "- untrained: not evaluated, not trained: <length>", "- absent: not evaluated, not evaluated",
     ]  # fmt: skip
