@@ -77,12 +77,12 @@ class PartSurface:
         signed[inside] = -self.distance_m(positions_m[inside])
         return signed
 
-    def nearest(self, positions_m: np.ndarray) -> SignedDistance:
+    def nearest(self, positions_m: np.ndarray, most_m: float = np.inf) -> SignedDistance:
         """Signed distance, closest surface point and unit gradient of the distance.
 
-        Positions that are not finite get an infinite distance; the rest is NaN.
+        Positions that are not finite, or outside and farther than ``most_m``, get an infinite distance, and NaN.
         """
-        signed = self.signed_m(positions_m)
+        signed = self.signed_m(positions_m, most_m)
         distance = np.abs(signed)
         closest, triangle = np.full((len(positions_m), 3), np.nan), np.zeros(len(positions_m), np.int64)
         nearest_triangles(self.tree, positions_m, distance, closest, triangle)
@@ -173,15 +173,18 @@ class SurfaceIndex:
             depth.reshape(-1)[inside] = np.maximum(depth.reshape(-1)[inside], surface.distance_m(positions[inside]))
         return depth
 
-    def nearest(self, positions_m: np.ndarray, hinge_rad: np.ndarray | None) -> SignedDistance:
+    def nearest(self, positions_m: np.ndarray, hinge_rad: np.ndarray | None, most_m: float = np.inf) -> SignedDistance:
         """Signed distances (frame, position), closest points and gradients (frame, position, 3), object frame.
 
-        Uses ``filled``. With two parts, the smaller signed distance counts. Arguments as in ``within``.
+        Uses ``filled``. With two parts, the smaller signed distance counts. Arguments as in ``within``; positions
+        outside and farther than ``most_m`` get an infinite distance, and NaN.
         """
-        return reduce(nearer_of, (self._nearest_of(part, positions_m, hinge_rad) for part in self.filled))
+        return reduce(nearer_of, (self._nearest_of(part, positions_m, hinge_rad, most_m) for part in self.filled))
 
-    def _nearest_of(self, part: int, positions_m: np.ndarray, hinge_rad: np.ndarray | None) -> SignedDistance:
-        nearest = self.filled[part].nearest(self._in_part(positions_m, hinge_rad, part))
+    def _nearest_of(
+        self, part: int, positions_m: np.ndarray, hinge_rad: np.ndarray | None, most_m: float
+    ) -> SignedDistance:
+        nearest = self.filled[part].nearest(self._in_part(positions_m, hinge_rad, part), most_m)
         object_from_part = self.model.object_from_part(part, hinge_rad)
         closest, normal = (array.reshape(positions_m.shape) for array in nearest[1:])
         distance = nearest.distance_m.reshape(positions_m.shape[:2])

@@ -67,7 +67,10 @@ def _person(task: _Task, subject: str, pair: HandPair) -> Person:
 def _sound_sequence(
     task: _Task, entry: Entry, person: Person, grips: list[tuple[Grip, ...]], pair: HandPair
 ) -> TruthSequence:
-    """Sample start, path size and grasp until the action is plausible. Reserve grasps come last."""
+    """Sample start, path size and grasp until the action is plausible. Reserve grasps come last.
+
+    Hands move less within the grasp in later attempts.
+    """
     dataset, action = task.dataset, ACTIONS[task.dataset][task.action]
     spec, model = object_spec(dataset, action.object_name), object_model(dataset, action.object_name)
     rng = np.random.default_rng([task.seed, DATASET_IDS[dataset], entry.action, _number(entry.subject), entry.number])
@@ -78,7 +81,8 @@ def _sound_sequence(
     order = [*(usual[(entry.number + number) % len(usual)] for number in range(len(usual))), *grips[GRASPS_PER_PAIR:]]
     for attempt in range(_ATTEMPTS):
         grip = order[attempt % len(order)]
-        truth = make_sequence(dataset, action, spec, model, grip, person, key, length, rng)
+        play = 1 - attempt / (_ATTEMPTS - 1)
+        truth = make_sequence(dataset, action, spec, model, grip, person, key, length, pair, play, rng)
         if measure(truth, pair).is_sound:
             return truth
     raise HoidataError(

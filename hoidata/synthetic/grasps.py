@@ -25,6 +25,7 @@ from hoidata.synthetic.hand_capsules import OPEN_RAD, CapsuleHands, capsule_poin
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
 LARGEST_PENETRATION_M = 0.007
+REACH_M = 0.008  # vertices that are farther from the object than this have an infinite distance
 LARGEST_JOINT_DISTANCE_M = 0.012
 SMALLEST_HAND_GAP_M = 0.006
 STAND_RADIUS_M = 0.02
@@ -328,7 +329,7 @@ def _verify_at(scene: Scene, grasp: GraspSpec, hands, meshes, pair: HandPair, an
     surface, near, touch, patches = surface_index(scene.model), [], [], []
     for (side, approach), (vertices, joints) in zip(grasp.approaches, meshes, strict=True):
         object_from_world = scene.upright.T @ (lid_rotation if approach.part == 1 else np.eye(3))
-        near.append(surface.nearest(vertices @ object_from_world.T, hinge))
+        near.append(surface.nearest(vertices @ object_from_world.T, hinge, REACH_M))
         touch.append(surface.nearest(joints @ object_from_world.T, hinge).distance_m.min(1))
         patches.append(hand_patches(pair[side]))
     centre = body_motion(

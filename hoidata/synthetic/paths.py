@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hoidata.clips.clip import FPS
+
 
 class Key(NamedTuple):
     """A keyframe."""
@@ -48,13 +50,17 @@ class ObjectPath(NamedTuple):
 
 
 UP = (0.0, 0.0, 0.16)
+_WAVES = 4
 
 MOTIONS: dict[str, Motion] = {
     "grab": Motion((Key(0), Key(0.25), Key(0.9, (0, 0, 0.15)), Key(1, (0, 0, 0.15))), lowered_after=18),
     "grasp": Motion((Key(0), Key(0.35), Key(0.95, (0, 0, 0.06)), Key(1, (0, 0, 0.06))), lowered_after=14),
-    "lift": Motion((Key(0), Key(0.15), Key(0.5, (0, 0, 0.21)), Key(0.62, (0, 0, 0.21)), Key(0.95), Key(1))),
+    "lift": Motion(
+        (Key(0), Key(0.15), Key(0.5, (0, 0, 0.21), (22, 0, 0)), Key(0.62, (0, 0, 0.21), (22, 0, 0)), Key(0.95), Key(1))
+    ),
     "place": Motion(
-        (Key(0, (0, -0.03, 0.13)), Key(0.55, (0.1, 0.08, 0.1)), Key(0.92, (0.1, 0.08, 0)), Key(1, (0.1, 0.08, 0))),
+        (Key(0, (0, -0.03, 0.13), (20, 0, 0)), Key(0.55, (0.1, 0.08, 0.1), (0, 14, 0)), Key(0.92, (0.1, 0.08, 0)),
+         Key(1, (0.1, 0.08, 0))),
         lifted_before=18,
     ),
     "put in": Motion(
@@ -99,7 +105,8 @@ MOTIONS: dict[str, Motion] = {
          Key(0.7, (0, 0.02, 0.18)), Key(0.96), Key(1))
     ),
     "shake": Motion(
-        (Key(0), Key(0.08), Key(0.25, (0, -0.03, 0.17)), Key(0.8, (0, -0.03, 0.17)), Key(0.97), Key(1)),
+        (Key(0), Key(0.08), Key(0.25, (0, -0.03, 0.17), (0, -30, 0)), Key(0.8, (0, -0.03, 0.17), (0, -30, 0)),
+         Key(0.97), Key(1)),
         Swing(0.25, 0.8, 5, (0, 0, 0.03)),
     ),
     "hand over": Motion(
@@ -133,19 +140,21 @@ MOTIONS: dict[str, Motion] = {
         Swing(0.24, 0.8, 6, (0, 0, 0.004)),
     ),
     "open": Motion(
-        (Key(0, hinge=0.4), Key(0.1, hinge=0.4), Key(0.3, (0, 0, 0.09), hinge=0.4),
-         Key(0.75, (0, 0, 0.09), hinge=0.85), Key(0.97, hinge=0.85), Key(1, hinge=0.85))
+        (Key(0, hinge=0.4), Key(0.1, hinge=0.4), Key(0.4, (0, 0, 0.09), (-22, 0, 0), hinge=0.4),
+         Key(0.54, (0, 0, 0.09), (-22, 0, 0), hinge=0.85), Key(0.97, hinge=0.85), Key(1, hinge=0.85))
     ),
     "close": Motion(
-        (Key(0, hinge=0.85), Key(0.1, hinge=0.85), Key(0.3, (0, -0.02, 0.07), hinge=0.85),
-         Key(0.72, (0, -0.02, 0.07), hinge=0.4), Key(0.97, hinge=0.4), Key(1, hinge=0.4))
+        (Key(0, hinge=0.85), Key(0.1, hinge=0.85), Key(0.42, (0, -0.02, 0.07), (-18, 0, 0), hinge=0.85),
+         Key(0.58, (0, -0.02, 0.07), (-18, 0, 0), hinge=0.4), Key(0.97, hinge=0.4), Key(1, hinge=0.4))
     ),
     "operate": Motion(
-        (Key(0, hinge=0.4), Key(0.1, hinge=0.4), Key(0.25, (0, -0.03, 0.05), hinge=0.4),
-         Key(0.42, (0, -0.03, 0.05), hinge=0.85), Key(0.58, (0, -0.03, 0.05), hinge=0.85),
-         Key(0.78, (0, -0.03, 0.05), hinge=0.4), Key(0.97, hinge=0.4), Key(1, hinge=0.4))
+        (Key(0, hinge=0.4), Key(0.1, hinge=0.4), Key(0.28, (0, -0.03, 0.05), (-14, 0, 0), hinge=0.4),
+         Key(0.38, (0, -0.03, 0.05), (-14, 0, 0), hinge=0.85), Key(0.6, (0, -0.03, 0.05), (-14, 0, 0), hinge=0.85),
+         Key(0.7, (0, -0.03, 0.05), (-14, 0, 0), hinge=0.4), Key(0.97, hinge=0.4), Key(1, hinge=0.4))
     ),
 }  # fmt: skip
+# Sway of a carried object: rates, standard deviations of shift and rotation, and the height from which it is full.
+_SWAY_HZ, SWAY_M, SWAY_DEG, _CARRIED_M = (0.2, 0.6), 0.005, 4.0, 0.06
 _MIRRORED_SHIFT = np.array([-1.0, 1.0, 1.0])
 _MIRRORED_ROTATION = np.array([1.0, -1.0, -1.0])
 
@@ -183,6 +192,22 @@ def follow_path(
     if mirrored:
         shift_m, rotation_rad = shift_m * _MIRRORED_SHIFT, rotation_rad * _MIRRORED_ROTATION
     return ObjectPath(shift_m, rotation_rad, values[:, 6])
+
+
+def with_sway(
+    path: ObjectPath, times: np.ndarray, rng: np.random.Generator, sway_m: float = SWAY_M, sway_deg: float = SWAY_DEG
+) -> ObjectPath:
+    """Add a slow sway to a carried object."""
+    sway = minimum_jerk(path.shift_m[:, 2:] / _CARRIED_M) * waves(times, _SWAY_HZ, 6, rng)
+    return path._replace(
+        shift_m=path.shift_m + sway_m * sway[:, :3], rotation_rad=path.rotation_rad + np.deg2rad(sway_deg) * sway[:, 3:]
+    )
+
+
+def waves(times: np.ndarray, rates_hz: tuple[float, float], width: int, rng: np.random.Generator) -> np.ndarray:
+    """Return (time, width) smooth random numbers of variance 1, sums of sines. times: frames at 30 fps."""
+    rate, phase = rng.uniform(*rates_hz, (_WAVES, width)), rng.uniform(0, 2 * np.pi, (_WAVES, width))
+    return np.sin(2 * np.pi * times[:, None, None] / FPS * rate + phase).sum(axis=1) * np.sqrt(2 / _WAVES)
 
 
 def _rest(key: np.ndarray, at_start: bool) -> np.ndarray:

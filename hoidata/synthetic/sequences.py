@@ -1,6 +1,7 @@
 """Builds a whole action from a grasp and a path: approach, close, carry, open, retreat."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -12,13 +13,20 @@ from hoidata.objects.model import ObjectModel, articulate
 from hoidata.synthetic.actions import LENGTH_DEVIATION, LONGEST_CLIP, MEAN_LENGTH, SHORTEST_CLIP, Action
 from hoidata.synthetic.catalogue import ObjectSpec
 from hoidata.synthetic.grasps import Grip
-from hoidata.synthetic.paths import ObjectPath, follow_path, minimum_jerk
+from hoidata.synthetic.hand_play import grasp_play, recorded_hand, recorded_object
+from hoidata.synthetic.paths import ObjectPath, follow_path, minimum_jerk, with_sway
 from hoidata.synthetic.truth import TruthSequence
 
 # Durations in frames at 30 fps.
 APPROACH, CLOSE, OPEN, RETREAT = 10, 4, 3, 8
 LED_IN, LED_OUT = 6, 4  # frames of a labelled clip before and after the action
 _AWAY_M = 0.22
+_SIZES = (0.7, 0.9)  # of the paths, so that objects are not much faster than recorded ones
+# A regrasp: frames of the first contact, of the way out and of the stay away, and the distance; it needs a long action.
+_FIRST_HOLD, _WITHDRAW, _STAY, _WITHDRAWN_M = 6, 6, 6, 0.08
+REGRASP_FRAMES = _FIRST_HOLD + OPEN + 2 * _WITHDRAW + _STAY + CLOSE
+_REGRASP_FROM = 70  # shortest contact
+_REGRASPS = 0.3  # probability in a long action
 LIFTED_ABOVE_M = 0.015
 SOURCE_FPS = {"h2o": 30, "grab": 120, "arctic": 30}
 _IDLE_RIGHT_M = np.array([0.6, -0.35, 0.05])
@@ -38,6 +46,14 @@ class Timing:
     length: float  # of the path
     contact_stop: float
     end: float  # of the retreat
+
+
+class Release(NamedTuple):
+    """A hand lets go of the resting object and grasps it again a little later. Times in frames at 30 fps."""
+
+    side: Side
+    stop: float  # of the first contact
+    start: float  # of the second contact
 
 
 class Pace(NamedTuple):
@@ -95,33 +111,67 @@ def make_sequence(
     person: Person,
     source_key: str,
     length: int,
+    pair: HandPair,
+    play: float,
     rng: np.random.Generator,
 ) -> TruthSequence:
-    """Generate one action at the frame rate of the source."""
+    """Generate one action at the frame rate of the source. play: scale of the motion in the grasp and of the noise."""
     timing = plan_timing(dataset, action, length, rng)
+    release = None
+    if timing.start == timing.contact_start:
+        release = sample_release(grips, timing.start, timing.length, _REGRASPS, rng)
+    if release is not None:
+        timing = replace(timing, start=timing.start + REGRASP_FRAMES, length=timing.length - REGRASP_FRAMES)
     fps = SOURCE_FPS[dataset]
     times = np.arange(int(np.floor(timing.end * fps / FPS)) + 1) * (FPS / fps)
     hand = action.grasp.hand
-    size, rotation_scale = rng.uniform(0.9, 1.1, 2)
+    size, rotation_scale = rng.uniform(*_SIZES), rng.uniform(0.9, 1.1)
     path = follow_path(
         action.motion, times, timing.start, timing.length, hand == "left", float(size), float(rotation_scale)
     )
-    rotmats, translation = object_pose(spec, model, path, rng)
+    rotmats, translation = object_pose(spec, model, with_sway(path, times, rng), rng)
     hinge = path.hinge_rad if model.is_articulated else None
     idle_absent = dataset == "h2o" and bool(rng.random() < 0.5)
     hands: dict[Side, HandTrack] = {side: idle_hand(side, person, len(times), rng, not idle_absent) for side in SIDES}
     track = ObjectTrack(model, rotmat_to_rotvec(rotmats), translation, hinge)
+    spans = dict.fromkeys((grip.side for grip in grips), (timing.contact_start, timing.contact_stop))
     for grip in grips:
-        hands[grip.side] = grasping_hand(
-            grip, person, track, rotmats, times, (timing.contact_start, timing.contact_stop)
-        )
+        moves = grasp_play(grip, person.betas, track, pair).sample(times, play, rng)
+        grasps = grasps_of(spans[grip.side], grip.side, release)
+        hands[grip.side] = grasping_hand(grip, person, track, rotmats, times, grasps, moves)
     contact = (round(timing.contact_start * fps / FPS), round(timing.contact_stop * fps / FPS) + 1)
     return TruthSequence(
         dataset=dataset, subject=person.subject, source_key=source_key, raw_start=0, source_fps=fps, verb=action.verb,
-        object_name=spec.name, object_words=spec.words, intent=action.intent, hand_type=hand, hands=hands,
-        object=track, clip=_clip_span(dataset, action, timing, contact), contact=contact,
+        object_name=spec.name, object_words=spec.words, intent=action.intent, hand_type=hand,
+        hands={side: recorded_hand(hands[side], play, rng) for side in SIDES}, object=recorded_object(track, play, rng),
+        clip=_clip_span(dataset, action, timing, contact), contact=contact,
         lifted=lowest_point(track) > spec.stand_m + LIFTED_ABOVE_M, stand_m=spec.stand_m,
+        released=released_frames(release, fps // FPS),
     )  # fmt: skip
+
+
+def sample_release(
+    grips: tuple[Grip, ...], start: float, length: float, probability: float, rng: np.random.Generator
+) -> Release | None:
+    """Sample whether a hand regrasps at the start of a long action, before the object moves."""
+    side = grips[int(rng.integers(len(grips)))].side
+    if rng.random() > probability or length < _REGRASP_FROM:
+        return None
+    return Release(side, start + _FIRST_HOLD, start + REGRASP_FRAMES)
+
+
+def released_frames(release: Release | None, stride: int) -> dict[Side, tuple[int, int]]:
+    """Return ``TruthSequence.released``."""
+    if release is None:
+        return {}
+    return {release.side: (round(release.stop * stride) + 1, round(release.start * stride))}
+
+
+def grasps_of(contact: Span, side: Side, release: Release | None) -> tuple[Span, ...]:
+    """Divide the contact of a hand if it regrasps."""
+    if release is None or release.side != side:
+        return (contact,)
+    return (contact[0], release.stop), (release.start, contact[1])
 
 
 def _clip_span(dataset: str, action: Action, timing: Timing, contact: tuple[int, int]) -> tuple[int, int]:
@@ -149,20 +199,45 @@ def object_pose(
 
 
 def grasping_hand(
-    grip: Grip, person: Person, track: ObjectTrack, rotmats, times: np.ndarray, contact: Span, pace: Pace = USUAL_PACE
+    grip: Grip,
+    person: Person,
+    track: ObjectTrack,
+    rotmats: np.ndarray,
+    times: np.ndarray,
+    grasps: tuple[Span, ...],
+    moves: np.ndarray,
+    pace: Pace = USUAL_PACE,
 ) -> HandTrack:
-    """Return a hand that is fixed to the object during contact, and approaches and retreats along its back."""
+    """Return a hand that approaches, grasps once or twice, and retreats along its back.
+
+    Args:
+        grip: the grasp.
+        person: the subject.
+        track: motion of the object.
+        rotmats: (frame, 3, 3) its rotations.
+        times: (frame,) in frames at 30 fps.
+        grasps: intervals of contact.
+        moves: (frame, 51) motion within the grasp, of ``sliding_modes``.
+        pace: durations of the phases.
+    """
     model, hinge = track.model, track.hinge_rad
     follow = rotmats
     if grip.part == 1 and model.hinge is not None and hinge is not None:
         follow = rotmats @ rotvec_to_rotmat(model.hinge.axis * hinge[:, None])
-    world = follow @ grip.rotmat
-    start, stop = contact
+    start, stop = grasps[0][0], grasps[-1][1]
     arriving = 1 - minimum_jerk((times - (start - pace.close - pace.approach)) / pace.approach)
     leaving = minimum_jerk((times - stop - pace.open) / pace.retreat)
-    wrist = follow @ grip.wrist_m + track.translation_m + _AWAY_M * (arriving + leaving)[:, None] * world[:, :, 1]
-    closed = minimum_jerk((times - start + pace.close) / pace.close) - minimum_jerk((times - stop) / pace.open)
-    pose = grip.open_pose + closed[:, None] * (grip.hand_pose - grip.open_pose)
+    away_m, closed = _AWAY_M * (arriving + leaving), np.zeros(len(times))
+    for start, stop in grasps:
+        closed += minimum_jerk((times - start + pace.close) / pace.close) - minimum_jerk((times - stop) / pace.open)
+    for (_, stop), (start, _) in pairwise(grasps):
+        out, back = (times - stop - pace.open) / _WITHDRAW, (times - start + pace.close) / _WITHDRAW + 1
+        away_m += _WITHDRAWN_M * (minimum_jerk(out) - minimum_jerk(back))
+    moves = closed[:, None] * moves
+    world = follow @ rotvec_to_rotmat(moves[:, 3:6]) @ grip.rotmat
+    wrist = np.einsum("fij,fj->fi", follow, grip.wrist_m + moves[:, :3]) + track.translation_m
+    wrist += away_m[:, None] * world[:, :, 1]
+    pose = grip.open_pose + closed[:, None] * (grip.hand_pose - grip.open_pose) + moves[:, 6:]
     return hand_track(person, grip.side, wrist, rotmat_to_rotvec(world), pose, True)
 
 

@@ -20,6 +20,7 @@ from hoidata.physics.contact_forces import (
     patch_contacts,
     required_wrench,
 )
+from hoidata.synthetic.grasps import REACH_M
 from hoidata.synthetic.truth import GRAVITY, TruthSequence
 
 LARGEST_PENETRATION_M = 0.009
@@ -29,9 +30,6 @@ _IDLE_M = 0.2
 # In clips with ``contact_by_side``, an idle hand may be close, but its joints keep out of the 2 cm within which a hand
 # is active. Joints of active hands stay above the table, and joints of the two hands stay apart.
 _NEAR_IDLE_M, _TABLE_M, _HANDS_APART_M = 0.028, 0.0, 0.012
-_SAME_M = 1e-5
-# A hand without a vertex closer than this has an infinite distance.
-_REACH_M = 0.008
 
 
 @dataclass(frozen=True)
@@ -104,7 +102,7 @@ def measure(truth: TruthSequence, pair: HandPair, hand_shift_m: np.ndarray | Non
 
 def _during_contact(truth: TruthSequence, values: dict[Side, np.ndarray]) -> np.ndarray:
     """Concatenate the values (frame,) of each hand during its contact."""
-    return np.concatenate([values[side][start:stop] for side, (start, stop) in truth.contact_by_side.items()])
+    return np.concatenate([values[side][truth.in_contact(side)] for side in truth.contact_by_side])
 
 
 def _near_idle(truth: TruthSequence, pair: HandPair) -> float:
@@ -172,20 +170,9 @@ def _object_points(truth: TruthSequence, points_m: np.ndarray, shift_m: np.ndarr
 
 
 def _distances(truth: TruthSequence, side: Side, pair: HandPair, shift_m: np.ndarray | None) -> SignedDistance:
-    """Return signed distances of the hand's vertices, computed once for frames with equal relative pose."""
+    """Return signed distances of the hand's vertices."""
     points = _object_points(truth, track_vertices(truth.hands[side], pair[side]), shift_m)
-    hinge = truth.object.hinge_rad
-    angle = np.zeros(len(points)) if hinge is None else hinge
-    signature = np.concatenate(
-        [points[:, list(TIP_VERTICES)].reshape(len(points), -1), points[:, :8].reshape(len(points), -1)], 1
-    )
-    keys = np.round(np.column_stack([signature, angle]) / _SAME_M)
-    changed = np.concatenate([[True], (np.abs(np.diff(keys, axis=0)) > 1).any(1)])
-    first = np.flatnonzero(changed)
-    first_index = np.cumsum(changed) - 1
-    nearest = surface_index(truth.object.model).nearest(points[first], None if hinge is None else hinge[first])
-    nearest = nearest._replace(distance_m=np.where(nearest.distance_m > _REACH_M, np.inf, nearest.distance_m))
-    return SignedDistance(*(array[first_index] for array in nearest))
+    return surface_index(truth.object.model).nearest(points, truth.object.hinge_rad, REACH_M)
 
 
 def _joint_distance(truth, side: Side, pair: HandPair, vertices: SignedDistance, shift_m) -> np.ndarray:

@@ -13,7 +13,8 @@ from hoidata.hands import HandPair, load_embedded_hands, track_joints
 from hoidata.synthetic.actions import DATASET_IDS
 from hoidata.synthetic.catalogue import model_of
 from hoidata.synthetic.grasps import Grip, PosedHands, Scene
-from hoidata.synthetic.paths import ObjectPath, follow_path, minimum_jerk
+from hoidata.synthetic.hand_play import grasp_play, recorded_hand, recorded_object
+from hoidata.synthetic.paths import ObjectPath, follow_path, minimum_jerk, with_sway
 from hoidata.synthetic.pools import search_pool
 from hoidata.synthetic.sequences import (
     LIFTED_ABOVE_M,
@@ -22,18 +23,23 @@ from hoidata.synthetic.sequences import (
     Person,
     Span,
     grasping_hand,
+    grasps_of,
     hand_track,
     idle_hand,
     lowest_point,
     make_person,
     object_pose,
+    released_frames,
+    sample_release,
 )
 from hoidata.synthetic.soundness import measure, vertex_distances_m
 from hoidata.synthetic.study_objects import ANGLES, STUDY_OBJECTS, Region, StudyObject
 from hoidata.synthetic.study_plan import HANDOVER, SCREWING, VERBS, StudyEntry, StudySize, choices, shares, study_plan
 from hoidata.synthetic.truth import TruthSequence
 
-_ATTEMPTS_PER_GRASP, _MAX_GRASPS = 3, 8  # for one clip
+_MAX_GRASPS = 8  # for one clip
+# Scales of the motion within the grasp and of the noise, of successive attempts with all grasps.
+_PLAYS = (1.0, 0.6, 0.3, 0.0, 0.0, 0.0)
 # Verbs of SCREWING come last, so that the random numbers of the other verbs do not depend on them.
 _VERB_STREAMS = (*sorted(VERBS.keys() - set(SCREWING)), *SCREWING)
 _STREAM, _PERSON_STREAM, _POOL_STREAM = 5_000_000, 5_000_001, 5_000_002
@@ -153,7 +159,7 @@ def _sound_clip(task: ClipTask, entry: StudyEntry, pair: HandPair) -> TruthSeque
         )
         grasps = grasps[:_MAX_GRASPS]
         first = int(rng.integers(max(1, len(grasps))))
-        for attempt in range(_ATTEMPTS_PER_GRASP * len(grasps)):
+        for attempt in range(len(_PLAYS) * len(grasps)):
             grips = grasps[(first + attempt) % len(grasps)]
             scenario = Scenario(
                 dataset=dataset,
@@ -165,7 +171,7 @@ def _sound_clip(task: ClipTask, entry: StudyEntry, pair: HandPair) -> TruthSeque
                 source_key=key,
                 left=left,
             )
-            truth = make_study_sequence(scenario, contact_frames, pair, rng)
+            truth = make_study_sequence(scenario, contact_frames, pair, _PLAYS[attempt // len(grasps)], rng)
             if measure(truth, pair).is_sound:
                 return truth
     raise HoidataError(
@@ -224,7 +230,8 @@ MARGIN = 15
 MIN_CONTACT_FRAMES, MAX_CONTACT_FRAMES = 26, 116
 _SPEEDS = (0.75, 1.0, 1.3)
 _MAX_PACE_CHANGE = 0.2  # variation of the speed within a motion
-_SWAY_M, _SWAY_DEG, _CARRIED_M = 0.003, 2.0, 0.06  # sway of a carried object, full above this height
+_SWAY_M, _SWAY_DEG = 0.003, 2.0  # sway of a carried object
+_REGRASPS = 0.9  # probability in a long action
 _ASIDE_DEG, _FAR_ASIDE_M = 12.0, 0.15  # rotation of an object that is moved aside, full from this distance
 # Handover: when the second hand has grasped and when the first releases, as fractions of the contact.
 _RECEIVED, _RELEASED = 0.42, 0.58
@@ -262,9 +269,9 @@ def sample_contact_frames(verb: str, rng: np.random.Generator) -> float:
 
 
 def make_study_sequence(
-    scenario: Scenario, contact_frames: float, pair: HandPair, rng: np.random.Generator
+    scenario: Scenario, contact_frames: float, pair: HandPair, play: float, rng: np.random.Generator
 ) -> TruthSequence:
-    """Generate a clip at the frame rate of the source."""
+    """Generate a clip at the frame rate of the source. play: scale of the motion in the grasp and of the noise."""
     dataset, study_object, person = scenario.dataset, scenario.study_object, scenario.person
     fps = SOURCE_FPS[dataset]
     stride = fps // FPS
@@ -272,12 +279,18 @@ def make_study_sequence(
     stop = start + contact_frames
     times = np.arange(int(np.floor((stop + PACE.open + PACE.retreat) * stride)) + 1) / stride
     spec, model = scenario.region.standing(study_object.spec), model_of(study_object.spec)
-    rotmats, translation, hinge = _object_motion(scenario, times, start, contact_frames, rng)
+    release = (
+        None if scenario.verb == HANDOVER else sample_release(scenario.grips, start, contact_frames, _REGRASPS, rng)
+    )
+    path_start = start if release is None else release.start
+    rotmats, translation, hinge = _object_motion(scenario, times, path_start, stop - path_start, rng)
     track = ObjectTrack(model, rotmat_to_rotvec(rotmats), translation, hinge)
     spans = _spans(scenario, start, contact_frames)
-    hands: dict[Side, HandTrack] = {
-        grip.side: grasping_hand(grip, person, track, rotmats, times, spans[grip.side], PACE) for grip in scenario.grips
-    }
+    hands: dict[Side, HandTrack] = {}
+    for grip in scenario.grips:
+        moves = grasp_play(grip, person.betas, track, pair).sample(times, play, rng)
+        grasps = grasps_of(spans[grip.side], grip.side, release)
+        hands[grip.side] = grasping_hand(grip, person, track, rotmats, times, grasps, moves, PACE)
     if len(hands) == 1:
         hands["left"] = _idle_hand(person, track, hands["right"], times, (start, stop), pair, rng)
     frames_by_side: dict[Side, tuple[int, int]] = {
@@ -287,62 +300,48 @@ def make_study_sequence(
     truth = TruthSequence(
         dataset=dataset, subject=person.subject, source_key=scenario.source_key, raw_start=0, source_fps=fps,
         verb=scenario.verb, object_name=spec.name, object_words=spec.words, intent=VERBS[scenario.verb].intent,
-        hand_type="both" if len(spans) == 2 else "right", hands=hands, object=track,
+        hand_type="both" if len(spans) == 2 else "right",
+        hands={side: recorded_hand(hand, play, rng) for side, hand in hands.items()},
+        object=recorded_object(track, play, rng),
         clip=(max(0, first - MARGIN * stride), min(len(times), last + MARGIN * stride)), contact=(first, last),
         lifted=lowest_point(track) > spec.stand_m + LIFTED_ABOVE_M, stand_m=spec.stand_m,
-        contact_by_side=frames_by_side,
+        contact_by_side=frames_by_side, released=released_frames(release, stride),
     )  # fmt: skip
     return mirrored(truth, person, study_object.mirror(scenario.region)) if scenario.left else truth
 
 
-def _object_motion(
-    scenario: Scenario, times: np.ndarray, start: float, contact_frames: float, rng: np.random.Generator
-):
+def _object_motion(scenario: Scenario, times: np.ndarray, start: float, length: float, rng: np.random.Generator):
     """Return world_from_object rotations and translations, and the hinge angles of an articulated object."""
     study_object, verb = scenario.study_object, VERBS[scenario.verb]
     motion = verb.motion_of("both" if len(scenario.grips) == 2 else "right")
-    size, rotation_scale = rng.uniform(0.85, 1.15, 2)
+    size, rotation_scale = rng.uniform(0.68, 0.92), rng.uniform(0.85, 1.15)
     if scenario.verb == "turn":
         rotation_scale *= rng.choice((-1.0, 1.0))
     elif scenario.verb in SCREWING and scenario.left:
         rotation_scale = -rotation_scale
-    path = follow_path(
-        motion,
-        _uneven_times(times, start, contact_frames, rng),
-        start,
-        contact_frames,
-        False,
-        float(size),
-        float(rotation_scale),
-    )
+    uneven_times = _uneven_times(times, start, length, rng)
+    path = follow_path(motion, uneven_times, start, length, False, float(size), float(rotation_scale))
     heading = np.deg2rad(rng.uniform(-verb.heading_deg, verb.heading_deg))
     path = path._replace(shift_m=path.shift_m @ rotvec_to_rotmat(np.array([0.0, 0.0, heading])).T)
-    path = _with_sway(path, times, rng)._replace(hinge_rad=_hinge(path, scenario.verb, rng))
+    path = _turned_aside(with_sway(path, times, rng, _SWAY_M, _SWAY_DEG), rng)
+    path = path._replace(hinge_rad=_hinge(path, scenario.verb, rng))
     spec, model = scenario.region.standing(study_object.spec), model_of(study_object.spec)
     rotmats, translation = object_pose(spec, model, path, rng)
     return rotmats, translation, path.hinge_rad if model.is_articulated else None
 
 
-def _uneven_times(times: np.ndarray, start: float, contact_frames: float, rng: np.random.Generator) -> np.ndarray:
+def _uneven_times(times: np.ndarray, start: float, length: float, rng: np.random.Generator) -> np.ndarray:
     """Warp the times so that the motion is faster at its start or at its end."""
-    phase = (times - start) / contact_frames
+    phase = (times - start) / length
     inside = np.clip(phase, 0.0, 1.0)
-    return times + contact_frames * rng.uniform(-_MAX_PACE_CHANGE, _MAX_PACE_CHANGE) * inside * (1 - inside)
+    return times + length * rng.uniform(-_MAX_PACE_CHANGE, _MAX_PACE_CHANGE) * inside * (1 - inside)
 
 
-def _with_sway(path: ObjectPath, times: np.ndarray, rng: np.random.Generator) -> ObjectPath:
-    """Add a slow sway to a carried object, and a rotation to an object that is moved aside."""
-    rate_hz, phase = rng.uniform(0.2, 0.6, (2, 6)), rng.uniform(0, 2 * np.pi, (2, 6))
-    waves = np.sin(2 * np.pi * times[:, None, None] / FPS * rate_hz + phase).sum(axis=1) / np.sqrt(2)
-    sway_weight = minimum_jerk(path.shift_m[:, 2:] / _CARRIED_M)
+def _turned_aside(path: ObjectPath, rng: np.random.Generator) -> ObjectPath:
+    """Add a rotation to an object that is moved aside."""
     aside = np.linalg.norm(path.shift_m[:, :2], axis=1)
     yaw_rad = np.deg2rad(rng.uniform(-_ASIDE_DEG, _ASIDE_DEG)) * aside / max(_FAR_ASIDE_M, aside.max())
-    return path._replace(
-        shift_m=path.shift_m + _SWAY_M * sway_weight * waves[:, :3],
-        rotation_rad=path.rotation_rad
-        + np.deg2rad(_SWAY_DEG) * sway_weight * waves[:, 3:]
-        + yaw_rad[:, None] * [0.0, 0.0, 1.0],
-    )
+    return path._replace(rotation_rad=path.rotation_rad + yaw_rad[:, None] * [0.0, 0.0, 1.0])
 
 
 def _hinge(path: ObjectPath, verb: str, rng: np.random.Generator) -> np.ndarray:
@@ -420,6 +419,7 @@ def mirrored(truth: TruthSequence, person: Person, symmetry: np.ndarray) -> Trut
         hand_type=hand_type,
         object=replace(track, rotvec=rotmat_to_rotvec(rotmats), translation_m=track.translation_m * MIRROR),
         contact_by_side={other[side]: span for side, span in truth.contact_by_side.items()},
+        released={other[side]: span for side, span in truth.released.items()},
     )
 
 

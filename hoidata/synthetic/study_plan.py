@@ -18,6 +18,7 @@ from hoidata.synthetic.study_objects import STUDY_OBJECTS, Region, StudyObject
 
 StudySize = Literal["study", "study-small"]
 _UP = (0.0, 0.0, 0.17)
+_TILTED = (-25.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -45,9 +46,9 @@ def _turned(degrees: float) -> Motion:
 def _moving_lid(start: float, stop: float) -> tuple[Motion, Motion]:
     """Return the motions on the table, and lifted between two hands."""
     up = (0.0, 0.0, 0.09)
-    on_table = (Key(0, hinge=start), Key(0.15, hinge=start), Key(0.85, hinge=stop), Key(1, hinge=stop))
+    on_table = (Key(0, hinge=start), Key(0.35, hinge=start), Key(0.65, hinge=stop), Key(1, hinge=stop))
     lifted = (
-        Key(0, hinge=start), Key(0.1, hinge=start), Key(0.3, up, hinge=start), Key(0.72, up, hinge=stop),
+        Key(0, hinge=start), Key(0.1, hinge=start), Key(0.4, up, _TILTED, start), Key(0.62, up, _TILTED, stop),
         Key(0.95, hinge=stop), Key(1, hinge=stop),
     )  # fmt: skip
     return Motion(on_table), Motion(lifted)
@@ -85,8 +86,8 @@ VERBS = {
     "inspect": StudyVerb(
         "inspect", 84,
         _there_and_back(
-            _SHOWN, _SHOWN._replace(phase=0.38, rotation_deg=(12, 0, 60)),
-            _SHOWN._replace(phase=0.62, rotation_deg=(12, 0, -60)),
+            _SHOWN, _SHOWN._replace(phase=0.38, rotation_deg=(18, 0, 60)),
+            _SHOWN._replace(phase=0.62, rotation_deg=(18, 0, -60)),
             _SHOWN._replace(phase=0.78),
         ),
     ),

@@ -33,6 +33,8 @@ class TruthSequence:
     stand_m: float  # height of the stand that it rests on
     # ``contact`` of each hand; empty if the active hands grasp together and the other hand stays away
     contact_by_side: dict[Side, tuple[int, int]] = field(default_factory=dict)
+    # hands that let go and grasp again: first frame without contact and the first with contact again
+    released: dict[Side, tuple[int, int]] = field(default_factory=dict)
 
     @property
     def n_frames(self) -> int:
@@ -60,12 +62,18 @@ class TruthSequence:
 
     def contact_intervals(self) -> list[tuple[int, int, tuple[Side, ...]]]:
         """Divide the contact into intervals with the same hands: first frame, one past the last, and the hands."""
-        spans = self.contact_by_side or dict.fromkeys(self.active_sides, self.contact)
-        cuts = sorted({frame for span in spans.values() for frame in span})
+        touching = {side: self.in_contact(side) for side in self.active_sides}
+        changes = np.any([np.diff(flags, prepend=False, append=False) for flags in touching.values()], axis=0)
         return [
-            (start, stop, tuple(side for side in SIDES if side in spans and spans[side][0] <= start < spans[side][1]))
-            for start, stop in pairwise(cuts)
+            (int(start), int(stop), tuple(side for side in self.active_sides if touching[side][start]))
+            for start, stop in pairwise(np.flatnonzero(changes))
         ]
+
+    def in_contact(self, side: Side) -> np.ndarray:
+        """Return (frame,) bool: whether an active hand grasps the object."""
+        frames = np.arange(self.n_frames)
+        (start, stop), gap = self.contact_by_side.get(side, self.contact), self.released.get(side, (0, 0))
+        return (frames >= start) & (frames < stop) & ~((frames >= gap[0]) & (frames < gap[1]))
 
     def at_30_fps(self) -> "TruthSequence":
         """Return the whole action, with approach and retreat, at every ``stride``-th raw frame."""
@@ -82,6 +90,7 @@ class TruthSequence:
             clip=_span(frames, self.clip),
             contact=_span(frames, self.contact),
             contact_by_side={side: _span(frames, span) for side, span in self.contact_by_side.items()},
+            released={side: _span(frames, span) for side, span in self.released.items()},
         )
 
     def joints(self, pair: HandPair) -> dict[Side, np.ndarray]:

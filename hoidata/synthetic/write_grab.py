@@ -19,6 +19,7 @@ from hoidata.synthetic.truth import TruthSequence
 
 _COMPONENTS, _BODY_VERTICES = 24, 10475
 _TOUCH_M = 0.004
+_LABEL_FRAMES = 40  # 1/3 s with the same labels
 # Ids of GRAB's contact labels: the palm, then the finger segments in MANO's order.
 _HAND_ID = {"left": 21, "right": 22}
 _FINGER_ID = {"left": 26, "right": 41}
@@ -121,11 +122,13 @@ def _table_parameters(truth: TruthSequence) -> dict[str, np.ndarray]:
 def _object_contact(truth: TruthSequence, pair: HandPair) -> np.ndarray:
     """Return (frame, object vertex) int8 ids of the touching hand segments; 0 outside of the contact.
 
-    While the same hands grasp, they do not move relative to the object, so the labels are computed in one frame.
+    While the same hands grasp, they move little relative to the object, so the labels change only every 1/3 s.
     """
     contact = np.zeros((truth.n_frames, len(truth.object.model.vertices_m)), dtype=np.int8)
     for start, stop, sides in truth.contact_intervals():
-        contact[start:stop] = _labels(truth, (start + stop) // 2, sides, pair)
+        for first in range(start, stop, _LABEL_FRAMES):
+            last = min(first + _LABEL_FRAMES, stop)
+            contact[first:last] = _labels(truth, (first + last) // 2, sides, pair)
     return contact
 
 

@@ -10,16 +10,29 @@ from scipy.spatial.transform import Rotation
 
 from bench.naive import READERS, NaiveHands
 from hoidata.clips import SIDES
+from hoidata.clips.clip import ObjectTrack
 from hoidata.errors import HoidataError
 from hoidata.files import sha256_file
 from hoidata.files.restricted_pickle import ARRAYS, restricted_load
-from hoidata.hands import load_embedded_hands, track_joints
+from hoidata.hands import load_embedded_hands, track_joints, track_vertices
+from hoidata.metrics.corpus_statistics import LOST_FRAMES
+from hoidata.objects.distance import closest_points
 from hoidata.objects.mesh import load_mesh
+from hoidata.objects.model import articulate
+from hoidata.synthetic.catalogue import object_model
 from hoidata.synthetic.check import check_sequences, sequence_metrics
 from hoidata.synthetic.corpus import write_corpus, write_raw_sequence, write_shared_files
 from hoidata.synthetic.generate import make_action, place_in_raw_sequences, tasks_of
-from hoidata.synthetic.grasps import closes_force
-from hoidata.synthetic.sequences import Person, idle_hand
+from hoidata.synthetic.grasps import Grip, closes_force
+from hoidata.synthetic.sequences import (
+    REGRASP_FRAMES,
+    Person,
+    Release,
+    grasping_hand,
+    grasps_of,
+    idle_hand,
+    released_frames,
+)
 from hoidata.synthetic.soundness import measure
 from hoidata.synthetic.truth import TruthSequence
 
@@ -76,23 +89,47 @@ def test_hands_that_are_shifted_or_missing_do_not_explain_the_motion(truths, dat
 
 
 @pytest.mark.parametrize("dataset", ONE_ACTION)
-def test_while_held_the_hand_does_not_move_against_the_object(truths, dataset):
-    truth = truths[dataset]
-    frames = np.arange(*truth.contact)
-    track = truth.object
-    rotation = Rotation.from_rotvec(track.rotvec[frames])
+def test_in_contact_hands_touch_and_slide_and_fingers_move_and_before_and_after_they_are_away(truths, dataset):
+    truth, pair = truths[dataset].at_30_fps(), load_embedded_hands()
+    in_object = Rotation.from_rotvec(truth.object.rotvec).inv()
     for side in truth.active_sides:
-        local = rotation.inv().apply(truth.hands[side].wrist_m[frames] - track.translation_m[frames])
-        assert np.abs(local - local[0]).max() < 1e-9
+        touching, hand = truth.in_contact(side), truth.hands[side]
+        vertices = track_vertices(hand, pair[side]).astype(np.float64)
+        model, away = truth.object.model, []
+        for frame in np.flatnonzero(touching | (np.arange(truth.n_frames) % 5 == 0)):
+            local = in_object[frame].apply(vertices[frame] - truth.object.translation_m[frame])
+            angle = None if truth.object.hinge_rad is None else truth.object.hinge_rad[frame : frame + 1]
+            points_m = articulate(model.vertices_m, model.part, model.hinge, angle)[0]
+            away.append((frame, closest_points(points_m, model.faces, local).distance_m.min()))
+        assert max(distance for frame, distance in away if touching[frame]) < 0.004
+        assert min(away[0][1], away[-1][1]) > 0.02
+        wrist_m = in_object.apply(hand.wrist_m - truth.object.translation_m)
+        step_cm_s = 3000 * np.linalg.norm(np.diff(wrist_m, axis=0), axis=1)[touching[1:] & touching[:-1]]
+        assert 0.5 < step_cm_s.mean() < 12
+        joints = Rotation.from_rotvec(hand.hand_pose.reshape(-1, 3))
+        before, after = (np.arange(len(joints)).reshape(-1, 15)[part].ravel() for part in (np.s_[:-1], np.s_[1:]))
+        deg_s = 30 * np.rad2deg((joints[before].inv() * joints[after]).magnitude()).reshape(-1, 15).mean(axis=1)
+        assert 30 < deg_s[touching[1:] & touching[:-1]].mean() < 120
 
 
-@pytest.mark.parametrize("dataset", ONE_ACTION)
-def test_contact_lasts_from_the_frame_in_which_the_hand_is_closed_to_the_last_before_it_opens(truths, dataset):
-    truth = truths[dataset]
-    for side in truth.active_sides:
-        pose = truth.hands[side].hand_pose
-        closed = np.abs(pose - pose[sum(truth.contact) // 2]).max(axis=1) < 1e-12
-        np.testing.assert_array_equal(np.flatnonzero(closed), np.arange(*truth.contact))
+def test_a_hand_that_regrasps_lets_go_for_long_enough_to_count_and_comes_back():
+    times, person = np.arange(100.0), Person("s1", np.zeros(10), None)
+    model = object_model("grab", "cubelarge")
+    still = ObjectTrack(model, np.zeros((100, 3)), np.zeros((100, 3)))
+    grip = Grip(side="right", wrist_m=np.array([0.1, 0, 0]), rotmat=np.eye(3), hand_pose=np.full(45, 0.3),
+                open_pose=np.zeros(45), part=0)  # fmt: skip
+    release = Release("right", 26.0, 20.0 + REGRASP_FRAMES)
+    grasps = grasps_of((20.0, 80.0), "right", release)
+    assert grasps_of((20.0, 80.0), "left", release) == ((20.0, 80.0),)
+    hand = grasping_hand(grip, person, still, np.tile(np.eye(3), (100, 1, 1)), times, grasps, np.zeros((100, 51)))
+    away_m = np.linalg.norm(hand.wrist_m - grip.wrist_m, axis=1)
+    closed = np.all(np.isclose(hand.hand_pose, grip.hand_pose), axis=1)
+    expected = [*range(20, 27), *range(20 + REGRASP_FRAMES, 81)]
+    assert np.flatnonzero(closed & (away_m < 1e-9)).tolist() == expected
+    first, last = released_frames(release, 1)["right"]
+    assert np.setdiff1d(np.arange(20, 81), expected).tolist() == list(range(first, last))
+    assert np.sum(away_m[first:last] > 0.03) > LOST_FRAMES
+    assert hand.hand_pose[first:last].min() == pytest.approx(0.0)
 
 
 def test_an_idle_left_hand_is_the_mirror_image_of_a_right_one():
