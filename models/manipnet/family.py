@@ -28,6 +28,8 @@ from models.manipnet.rollout import Predictor, RolloutTask, Rule, roll_out
 from models.manipnet.training import MANIPNET
 
 NEAREST_COUNT = 10
+DIAGNOSED_CLIPS = 60  # test clips, evenly spread
+MAX_TRAINING_FRAMES = 60_000  # of the retrieval baselines, evenly spread; 1,336 numbers each
 
 
 class RecordedHand(NamedTuple):
@@ -62,19 +64,19 @@ def diagnose(
     settings: FeatureSettings,
     predict_clip: Callable[[ClipSample], Mapping[Side, np.ndarray]],
 ) -> Figures:
-    """Mean joint errors on test clips, millimetres.
+    """Mean joint errors on at most ``DIAGNOSED_CLIPS`` test clips, millimetres.
 
     Args:
         sources: the dataset.
         settings: of the features that baselines compare.
         predict_clip: returns finger rotations (frame, 15, 3, 3) by side.
     """
-    training_hands = [
-        recorded for sample in _samples(sources, "train") for recorded in recorded_hands(sample, sources.hands)
-    ]
-    test_hands = [
-        (sample, recorded) for sample in _samples(sources, "test") for recorded in recorded_hands(sample, sources.hands)
-    ]
+    training_hands = thinned(
+        [recorded for sample in _samples(sources, "train") for recorded in recorded_hands(sample, sources.hands)]
+    )
+    test_clips = _samples(sources, "test")
+    chosen = test_clips[:: max(1, -(-len(test_clips) // DIAGNOSED_CLIPS))]
+    test_hands = [(sample, recorded) for sample in chosen for recorded in recorded_hands(sample, sources.hands)]
     if not training_hands or not test_hands:
         return {}
     baselines = _baselines(training_hands, settings)
@@ -89,6 +91,12 @@ def diagnose(
             errors.setdefault(name, []).append(error_m.mean(axis=1))
     means = {name: round(1000 * float(np.concatenate(error_m).mean()), 3) for name, error_m in errors.items()}
     return {"manipnet": means}
+
+
+def thinned(hands: list[RecordedHand]) -> list[RecordedHand]:
+    """The hands with every n-th tracked frame, so that all together have about ``MAX_TRAINING_FRAMES`` or fewer."""
+    step = max(1, -(-sum(len(hand.tracked) for hand in hands) // MAX_TRAINING_FRAMES))
+    return [hand._replace(tracked=hand.tracked[::step]) for hand in hands]
 
 
 def _samples(sources: Sources, split: str) -> Sequence[ClipSample]:

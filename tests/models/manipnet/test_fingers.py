@@ -25,7 +25,7 @@ from models.common.predicting import PredictionConfig, requests_for
 from models.common.training import train_network
 from models.manipnet.animate import Gap, predict_fingers
 from models.manipnet.control import control_of, finger_rotmats_of, hands_of, trajectories_of
-from models.manipnet.family import FingerSampler
+from models.manipnet.family import FingerSampler, diagnose, recorded_hands, thinned
 from models.manipnet.features import FeatureSettings, outputs, pose_features
 from models.manipnet.inverse_kinematics import Limits, reach, target_points
 from models.manipnet.network import ManipNet, NetworkConfig
@@ -157,6 +157,22 @@ def test_a_stream_equals_the_rollout_of_the_clip_bit_for_bit(
     assert max(frame - number for number, frame in enumerate(push_frames)) == 0.5 * FPS
     for side_index, side in enumerate(SIDES):
         np.testing.assert_array_equal(np.stack([pose[side] for pose in poses]), whole[side_index])
+
+
+def test_thinned_training_frames_are_spread_over_all_hands(
+    annotated: AnnotatedStore, samples: list[ClipSample], fingers: FingerSampler, checkpoints: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    hands = [hand for sample in samples for hand in recorded_hands(sample, HANDS)]
+    total = sum(len(hand.tracked) for hand in hands)
+    assert [len(hand.tracked) for hand in thinned(hands)] == [len(hand.tracked) for hand in hands]
+    monkeypatch.setattr("models.manipnet.family.MAX_TRAINING_FRAMES", total // 4)
+    fewer = thinned(hands)
+    assert sum(len(hand.tracked) for hand in fewer) <= total // 4 + len(hands)
+    assert all(len(hand.tracked) >= 2 for hand in fewer)
+    sources = Sources(annotated, checkpoints, HANDS, torch.device("cpu"))
+    errors = diagnose(sources, fingers.predictor.settings, fingers.predict_clip)["manipnet"]
+    assert errors["joint_error_nearest_frame_mm"] < errors["joint_error_mean_pose_mm"]
 
 
 def test_two_trainings_give_the_same_bytes(annotated_root: Path, checkpoints: Path, tmp_path: Path) -> None:
