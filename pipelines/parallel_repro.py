@@ -185,10 +185,12 @@ def describe_run(run: Run) -> str:
     for name, seconds in run.seconds.items():
         kinds.setdefault(name.split(":")[-1].split("@")[0], []).append(seconds)
     by_time = sorted(kinds.items(), key=lambda entry: -sum(entry[1]))
-    lines = [f"{kind:16} {len(seconds):4} stages {sum(seconds):8.1f} s" for kind, seconds in by_time]
-    lines.append(
-        f"{'all':16} {len(run.seconds):4} stages {sum(run.seconds.values()):8.1f} s, in {run.wall:.1f} s wall time"
-    )
+    by_time.append(("all", list(run.seconds.values())))
+    lines = [
+        f"{kind:16} {len(seconds):4} {'stage' if len(seconds) == 1 else 'stages':6} {sum(seconds):8.1f} s"
+        for kind, seconds in by_time
+    ]
+    lines[-1] += f", in {run.wall:.1f} s wall time"
     lines += [f"failed: {name}; full output: {log_of(name)}" for name in run.failed]
     return "\n".join(lines)
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from hoidata.files.written import read_json
+from hoidata.files.written import Facts, read_json
 from pipelines.metrics_files import LEADING, read_metrics
 from pipelines.pages.metrics_table import markdown_table
 from pipelines.params import read_params
@@ -14,7 +14,10 @@ def describe_results(project: Path, profile: str) -> str:
     """Markdown with counts per dataset, a table of leading metrics per measured dataset, and the report's address."""
     params = read_params(project)
     notes: list[str] = []
-    lines = ["| dataset | clips | quarantined | train | validation | test |", "|---|---|---|---|---|---|"]
+    lines = [
+        "| dataset | quarantined | clips | annotated | train | validation | test |",
+        "|---|---|---|---|---|---|---|",
+    ]
     tables: list[str] = []
     for dataset in params["datasets"]:
         data, metrics = project / "data" / profile / dataset, project / "metrics" / profile / dataset
@@ -31,19 +34,20 @@ def describe_results(project: Path, profile: str) -> str:
 
 def _counts(dataset: str, data: Path) -> str:
     counts = read_json(data / "clips/meta/info.json", {"counts": {"clips": int, "quarantined": int}})["counts"]
+    annotated = _facts(data / "annotation/info.json", {"counts": {"annotated": int}}).get("counts", {})
     parts = _splits(data).get("chosen", {}).get("clips", {})
-    numbers = [parts.get(name, "") for name in ("train", "validation", "test")]
-    return f"| {' | '.join(map(str, (dataset, counts['clips'], counts['quarantined'], *numbers)))} |"
+    numbers = [annotated.get("annotated", ""), *(parts.get(name, "") for name in ("train", "validation", "test"))]
+    return f"| {' | '.join(map(str, (dataset, counts['quarantined'], counts['clips'], *numbers)))} |"
 
 
-def _splits(data: Path) -> dict[str, Any]:
+def _splits(data: Path) -> Facts:
     """The facts of the stage split of a dataset; empty before its first run."""
-    path = data / "splits/info.json"
-    if not path.is_file():
-        return {}
-    facts = read_json(path, {"chosen": {"clips": {}}})
-    facts.check_present({"missing": dict})
-    return facts
+    return _facts(data / "splits/info.json", {"chosen": {"clips": {}}}).check_present({"missing": dict})
+
+
+def _facts(path: Path, keys: dict[str, Any]) -> Facts:
+    """The content of a JSON file with these keys; empty if its stage has not run."""
+    return read_json(path, keys) if path.is_file() else Facts(path, {})
 
 
 def _measured(path: Path) -> bool:

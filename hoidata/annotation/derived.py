@@ -26,7 +26,8 @@ TURNED_RAD, MOVED_M = np.deg2rad(30), 0.05
 SHAKE_M, SHAKE_HALF_PERIODS, SHAKE_GAP_FRAMES, MIN_SHAKE_FRACTION = 0.015, 6, FPS // 3, 0.2
 SLOW_FRAMES = FPS // 2
 MIN_HOLD_FRACTION = 0.8  # of frames with contact: above it an object is held, below it touched
-# A hand that carries an object moves it at least this much; an object that is stiller rests on its support.
+# An object rests on its support if its lowest point rises and sinks by less than STILL_M: a hand may slide or turn it
+# there, but cannot carry it as steadily. Without gravity, the whole motion has to be that small.
 STILL_M, STILL_RAD = 0.003, np.deg2rad(2)
 REST_FRAMES, REST_M = FPS // 6, 0.015  # a placed object moves by less in its last frames
 
@@ -49,7 +50,7 @@ class ObjectMotion:
     shakes: int  # number of whole oscillations
     shaken_frames: int  # number of frames that they take
     touched: float  # fraction of frames in which a hand is close
-    is_still: bool  # the object rests on its support in all frames
+    is_supported: bool  # the object rests on its support in all frames
     ends_at_rest: bool  # the object hardly moves in the last frames
     n_frames: int
 
@@ -65,7 +66,7 @@ def derive_verb(clip: Clip, evidence: HandEvidence) -> Derived:
     - turn: it rotates by 30 degrees or more.
     - move: it moves by 5 cm or more.
     - grasp: it rises by 1.5 cm or more.
-    - hold, or touch if the object rests on its support or hands are close in less than 80 % of the frames.
+    - hold, or touch if the object stays on its support or hands are close in less than 80 % of the frames.
 
     Args:
         clip: the clip.
@@ -88,7 +89,7 @@ def derive_verb(clip: Clip, evidence: HandEvidence) -> Derived:
         return Derived("move", f"moves {motion.travelled_m * 100:.1f} cm")
     if highest_m >= RAISED_M:
         return Derived("grasp", f"rises {highest_m * 100:.1f} cm, and does not leave its place")
-    verb = "hold" if motion.touched >= MIN_HOLD_FRACTION and not motion.is_still else "touch"
+    verb = "hold" if motion.touched >= MIN_HOLD_FRACTION and not motion.is_supported else "touch"
     return Derived(verb, f"at rest; near in {motion.touched:.0%} of frames")
 
 
@@ -105,6 +106,7 @@ def object_motion(clip: Clip, evidence: HandEvidence) -> ObjectMotion:
     shakes, shaken = _shakes(centre_m)
     turned_rad = float(rotation_angle(rotation[0].T @ rotation).max())
     hinge_range_rad = 0.0 if track.hinge_rad is None else float(np.ptp(track.hinge_rad))
+    is_still = np.ptp(centre_m, axis=0).max() < STILL_M and max(turned_rad, hinge_range_rad) < STILL_RAD
     touched = np.any([evidence.near(side) for side in SIDES], axis=0)
     return ObjectMotion(
         hinge_rad=None if track.hinge_rad is None else track.hinge_rad.astype(np.float64),
@@ -114,7 +116,7 @@ def object_motion(clip: Clip, evidence: HandEvidence) -> ObjectMotion:
         shakes=shakes,
         shaken_frames=shaken,
         touched=float(touched.mean()),
-        is_still=bool(np.ptp(centre_m, axis=0).max() < STILL_M and max(turned_rad, hinge_range_rad) < STILL_RAD),
+        is_supported=bool(is_still or (up is not None and np.ptp(track.lowest_m(up)) < STILL_M)),
         ends_at_rest=bool(np.ptp(centre_m[-REST_FRAMES:], axis=0).max() < REST_M),
         n_frames=clip.n_frames,
     )

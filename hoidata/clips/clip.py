@@ -114,6 +114,10 @@ class ObjectTrack(Track):
         """
         return self.world_from_object @ articulate(points_m, part, self.model.hinge, self.hinge_rad)
 
+    def lowest_m(self, up: np.ndarray) -> np.ndarray:
+        """(frame,) height of the lowest vertex above the world's origin, along the unit vector ``up``."""
+        return self.model.lowest_m(self.world_from_object, self.hinge_rad, up)
+
 
 @dataclass(frozen=True)
 class CameraTrack(Track):

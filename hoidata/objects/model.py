@@ -12,6 +12,7 @@ from hoidata.geometry.transform import IDENTITY, RigidTransform
 from hoidata.objects.mesh import MassProperties, mass_properties
 from hoidata.objects.solid import NoSolid, Solid, close_cut, solid_of
 
+_CHUNK_FRAMES = 16
 SEAM = 2  # in ``ObjectModel.face_part``: a triangle with corners on both parts
 
 
@@ -126,6 +127,25 @@ class ObjectModel:
         if hinge_rad is None:
             raise BadInput(f"motion of {self.name!r}", "a hinge angle for every frame", "none", "give the angles")
         return self.hinge.turn(hinge_rad)
+
+    def lowest_m(self, world_from_object: RigidTransform, hinge_rad: np.ndarray | None, up: np.ndarray) -> np.ndarray:
+        """Height of the lowest vertex in each frame, (frame,) along ``up`` above the world's origin.
+
+        Args:
+            world_from_object: (frame,) poses.
+            hinge_rad: (frame,), None for a rigid object.
+            up: (3,) unit vector, world.
+        """
+        lowest = []
+        for part in self.parts:
+            world_from_part = world_from_object @ self.object_from_part(part, hinge_rad)
+            vertices_m = self.vertices_m[self.part == part] if self.is_articulated else self.vertices_m
+            # height = up @ (R v + t) = (up @ R) @ v + up @ t: no vertex is transformed to the world.
+            up_in_part, origins_m = up @ world_from_part.rotation, world_from_part.translation @ up
+            starts = range(0, len(up_in_part), _CHUNK_FRAMES)
+            heights_m = [(vertices_m @ up_in_part[start : start + _CHUNK_FRAMES].T).min(axis=0) for start in starts]
+            lowest.append(np.concatenate([np.zeros(0), *heights_m]) + origins_m)
+        return np.minimum.reduce(lowest)
 
 
 def articulate(points_m: np.ndarray, part: np.ndarray, hinge: Hinge | None, hinge_rad: np.ndarray | None) -> np.ndarray:

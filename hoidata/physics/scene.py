@@ -7,6 +7,7 @@ import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack
 from hoidata.errors import BadInput
+from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import HandModel, HandPair
 from hoidata.objects.model import ObjectModel, articulate
 from hoidata.physics.capsules import Capsules, ObjectPoses, joined
@@ -15,7 +16,6 @@ from hoidata.physics.mano_capsules import hand_capsules
 
 LIFTED_M = 0.015
 TABLE_PERCENTILE = 3
-_CHUNK_FRAMES = 16
 _FALLING_FRACTION = 0.05  # an object falls if its support force is below this fraction of its weight
 
 
@@ -56,18 +56,9 @@ class Scene:
     @cached_property
     def lowest_m(self) -> np.ndarray:
         """(frame,) height of the object's lowest vertex."""
-        return np.minimum.reduce([self._lowest_of_part_m(part) for part in self.model.parts])
-
-    def _lowest_of_part_m(self, part: int) -> np.ndarray:
-        """(frame,) height of one part's lowest vertex, by the up direction in the part's frame."""
-        model, world_from_part = self.model, self.poses.world_from_part(self.model, part)
-        vertices_m = model.vertices_m[model.part == part] if model.is_articulated else model.vertices_m
-        up = -self.gravity
-        # height = up @ (R v + t) = (up @ R) @ v + up @ t: no vertex is transformed to the world.
-        up_in_part, origins_m = up @ world_from_part.rotation, world_from_part.translation @ up
-        starts = range(0, self.n_frames, _CHUNK_FRAMES)
-        lowest = [(vertices_m @ up_in_part[start : start + _CHUNK_FRAMES].T).min(axis=0) for start in starts]
-        return np.concatenate([np.zeros(0), *lowest]) + origins_m
+        poses = self.poses
+        world_from_object = RigidTransform(poses.rotmats, poses.translation_m)
+        return self.model.lowest_m(world_from_object, poses.hinge_rad, -self.gravity)
 
     @property
     def table_height_m(self) -> float:

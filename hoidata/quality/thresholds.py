@@ -68,7 +68,7 @@ CLIP_MEASURES = (
     Measure(
         "time_offset_frames",
         "frames",
-        "lag between hands and object, either way",
+        "lag between hands and object",
         warn=1.0,
         leave_out=5.0,
         unmeasured="hands move with the object in too few frames, or too unlike it",
@@ -169,7 +169,9 @@ def reasons_of(violations: Sequence[Finding]) -> str:
 def _reason(measure: Measure, values: Mapping[str, float], limit: float) -> str:
     unit = f" {measure.unit}" if measure.unit else ""
     frame = f" at frame {values[measure.frame]:g}" if measure.frame else ""
-    return f"{measure.words}: {values[measure.name]:.3g}{unit}{frame}, above {limit:g}{unit}"
+    value = values[measure.name]
+    beyond = f"above {limit:g}" if value > 0 else f"below {-limit:g}"
+    return f"{measure.words}: {value:.3g}{unit}{frame}, {beyond}{unit}"
 
 
 def exclusion_reasons(folder: str | Path) -> dict[str, str]:

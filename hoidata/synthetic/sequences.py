@@ -145,7 +145,7 @@ def make_sequence(
         object_name=spec.name, object_words=spec.words, intent=action.intent, hand_type=hand,
         hands={side: recorded_hand(hands[side], play, rng) for side in SIDES}, object=recorded_object(track, play, rng),
         clip=_clip_span(dataset, action, timing, contact), contact=contact,
-        lifted=lowest_point(track) > spec.stand_m + LIFTED_ABOVE_M, stand_m=spec.stand_m,
+        lifted=track.lowest_m(np.eye(3)[2]) > spec.stand_m + LIFTED_ABOVE_M, stand_m=spec.stand_m,
         released=released_frames(release, fps // FPS),
     )  # fmt: skip
 
@@ -278,14 +278,3 @@ def make_person(dataset: str, subject: str, pair: HandPair, rng: np.random.Gener
         shaped = pair[side].template_m + pair[side].shape_directions @ betas
         meshes[side] = shaped.astype(np.float32).astype(np.float64)
     return Person(subject, betas, meshes)
-
-
-def lowest_point(track: ObjectTrack) -> np.ndarray:
-    """Return (frame,) height of the object's lowest vertex."""
-    model = track.model
-    points = articulate(model.vertices_m, model.part, model.hinge, track.hinge_rad)
-    up = rotvec_to_rotmat(track.rotvec)[:, 2]
-    return (
-        np.einsum("fpi,fi->fp", np.broadcast_to(points, (len(up), *points.shape[1:])), up).min(1)
-        + track.translation_m[:, 2]
-    )

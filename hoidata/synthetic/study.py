@@ -26,7 +26,6 @@ from hoidata.synthetic.sequences import (
     grasps_of,
     hand_track,
     idle_hand,
-    lowest_point,
     make_person,
     object_pose,
     released_frames,
@@ -304,7 +303,7 @@ def make_study_sequence(
         hands={side: recorded_hand(hand, play, rng) for side, hand in hands.items()},
         object=recorded_object(track, play, rng),
         clip=(max(0, first - MARGIN * stride), min(len(times), last + MARGIN * stride)), contact=(first, last),
-        lifted=lowest_point(track) > spec.stand_m + LIFTED_ABOVE_M, stand_m=spec.stand_m,
+        lifted=track.lowest_m(np.eye(3)[2]) > spec.stand_m + LIFTED_ABOVE_M, stand_m=spec.stand_m,
         contact_by_side=frames_by_side, released=released_frames(release, stride),
     )  # fmt: skip
     return mirrored(truth, person, study_object.mirror(scenario.region)) if scenario.left else truth

@@ -118,7 +118,7 @@ def read_hand() -> None:
 
 READERS: dict[str, list[Callable[[], object]]] = {
     f"{DATA}/quality/info.json": [read_quality_files],
-    f"{DATA}/annotation/info.json": [read_annotated],
+    f"{DATA}/annotation/info.json": [read_annotated, lambda: describe_results(Path(), "embedded")],
     f"{DATA}/contact/info.json": [read_annotated, lambda: read_contact_settings(DATA / "contact")],
     f"{DATA}/splits/info.json": [read_annotated, lambda: describe_results(Path(), "embedded")],
     f"{DATA}/clips/meta/info.json": [lambda: describe_results(Path(), "embedded"), read_annotated],

@@ -73,7 +73,11 @@ def test_a_split_without_validation_clips_is_reported_with_the_metrics_and_after
     text = write(folders, hands, tmp_path / "report", "grab")
     assert text.index("Metrics of all methods") < text.index(f"The split has {words}.") < text.index("<h3>Counts</h3>")
     (tmp_path / "params.yaml").write_text("profile: embedded\ndatasets: [grab]\nfamilies: [ground-truth]\n")
-    assert f"grab: {words}." in describe_results(tmp_path, "embedded").splitlines()
+    described = describe_results(tmp_path, "embedded").splitlines()
+    assert f"grab: {words}." in described
+    header, _, counts = described[:3]
+    assert header == "| dataset | quarantined | clips | annotated | train | validation | test |"
+    assert counts == "| grab | 1 | 3 | 3 | 2 | 0 | 1 |"
 
 
 @pytest.mark.slow
