@@ -206,7 +206,8 @@ class Clip:
     source_fps: float = float(FPS)
     gravity_note: str = ""  # how gravity was estimated, or why it is unknown; empty if the source states it
     hands_from: Literal["parameters", "keypoints"] = "parameters"  # hands of the source, or fitted to keypoints
-    fit_error_m: float | None = None  # mean error of fitted hands over all valid frames; None for parameters
+    # mean error of fitted hands over the valid frames, of segments over the whole recording; None for parameters
+    fit_error_m: float | None = None
     camera: CameraTrack | None = None
     body: BodyTrack | None = None
     source_contact: SourceContact | None = None

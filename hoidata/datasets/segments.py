@@ -3,7 +3,7 @@
 A recording needs no words for it. The verb of each segment follows later (``hoidata.annotation.derived``).
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import pairwise
 from typing import Literal, NamedTuple
@@ -14,9 +14,12 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 from hoidata.actions.action import object_middle_m
 from hoidata.annotation.derived import turning_points
 from hoidata.clips.clip import FPS, SIDES, Clip, Side
+from hoidata.clips.quarantine import Quarantined
 from hoidata.contact.maps import find_active_hands
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.contact.settings import ContactSettings
+from hoidata.datasets.base import RawTree
+from hoidata.datasets.gaps import trim_to_recorded
 from hoidata.geometry.intervals import Interval, bridged, runs
 from hoidata.geometry.rotations import rotation_angle
 from hoidata.hands import HandPair, track_joints
@@ -34,6 +37,9 @@ ARTICULATED_RAD = np.deg2rad(6)
 REVERSED_RAD = np.deg2rad(15)  # a hinge that reverses by this much was opened and is now closed
 LIFTED_M = 0.08  # an object that rises and sinks by this much is lifted and then placed
 
+# The setting ``clips`` of adapters with descriptions: one clip per described action, the whole recording, its segments,
+# or the segments of recordings without a description.
+ClipSource = Literal["described", "whole", "segments", "described-else-segments"]
 Event = Literal["approach", "articulation", "hand change", "carrying", "top of a lift", "slow frame", "release"]
 
 
@@ -63,23 +69,41 @@ class ObjectSignals(NamedTuple):
     hinge_rad: np.ndarray | None  # (frame,); None for a rigid object
 
 
-def segment_clips(recording: Clip, hands: HandPair) -> list[Clip]:
-    """The segments of a recording as clips. Ids get the frames, counted from 1 and including the last.
+def has_description(clips: ClipSource, raw: RawTree, path: str) -> bool:
+    """Whether an adapter with the setting ``clips`` needs the description of a sequence, the raw file ``path``."""
+    is_present = raw.has(path) or path in (raw.manifest or ())
+    return clips == "described" or (clips == "described-else-segments" and is_present)
 
-    A recording of at most 150 frames, or without contact, is not cut.
+
+def segment_clips(items: Iterable[Clip | Quarantined], hands: HandPair) -> Iterator[Clip | Quarantined]:
+    """The segments of each recording as clips. Ids get the frames, counted from 1 and including the last.
+
+    A recording of at most 150 frames is not cut. One without contact is quarantined.
     """
-    if recording.n_frames <= LONGEST_FRAMES:
-        return [recording]
-    points = sample_points(recording.object.model, ContactSettings().points)
+    for item in items:
+        yield from [item] if isinstance(item, Quarantined) else _segments_of(item, hands)
+
+
+def _segments_of(recording: Clip, hands: HandPair) -> Iterator[Clip | Quarantined]:
+    points, settings = sample_points(recording.object.model, ContactSettings().points), ContactSettings()
     joints_m: dict[Side, np.ndarray] = {side: track_joints(recording.hands[side], hands[side]) for side in SIDES}
-    evidence = find_active_hands(recording, joints_m, ProximityIndex(points), ContactSettings().threshold_m)
-    return [_taken(recording, segment) for segment in find_segments(recording, evidence)] or [recording]
-
-
-def _taken(recording: Clip, segment: Segment) -> Clip:
-    clip = recording.take(slice(segment.start, segment.stop))
-    first, last = int(clip.source_frames[0]) + 1, int(clip.source_frames[-1]) + 1
-    return replace(clip, clip_id=f"{recording.clip_id}/{first:04d}-{last:04d}")
+    evidence = find_active_hands(recording, joints_m, ProximityIndex(points), settings.threshold_m)
+    if evidence.hand_type is None:
+        expected = f"a hand within {settings.threshold_m * 100:g} cm of the object"
+        yield Quarantined(
+            recording.clip_id,
+            where=recording.sequence,
+            expected=expected,
+            got="none in any frame",
+            remedy="nothing to do",
+        )
+    elif recording.n_frames <= LONGEST_FRAMES:
+        yield recording
+    else:
+        for segment in find_segments(recording, evidence):
+            clip = recording.take(slice(*trim_to_recorded((segment.start, segment.stop), recording.recorded)))
+            first, last = int(clip.source_frames[0]) + 1, int(clip.source_frames[-1]) + 1
+            yield replace(clip, clip_id=f"{recording.clip_id}/{first:04d}-{last:04d}")
 
 
 def find_segments(recording: Clip, evidence: HandEvidence) -> list[Segment]:

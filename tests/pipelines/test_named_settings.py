@@ -14,12 +14,18 @@ from pipelines.cli import app
 from pipelines.commands.raw import _require_parts
 from pipelines.stages.base import StagePaths
 from pipelines.stages.raw import require_hand
-from tests.builders import arctic, h2o, hoi4d
+from tests.builders import arctic, h2o, hoi4d, oakink2
 
 
 def arctic_without_descriptions(root: Path) -> Path:
     arctic.write_two(root)
     shutil.rmtree(root / "description")
+    return root
+
+
+def oakink2_without_programs(root: Path) -> Path:
+    oakink2.write_two(root)
+    shutil.rmtree(root / "program")
     return root
 
 
@@ -31,20 +37,22 @@ def hoi4d_without_events(root: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "write", "clips"),
-    [("arctic", arctic_without_descriptions, "segments"), ("hoi4d", hoi4d_without_events, "whole")],
+    ("name", "write"),
+    [
+        ("arctic", arctic_without_descriptions),
+        ("hoi4d", hoi4d_without_events),
+        ("oakink2", oakink2_without_programs),
+    ],
 )
-def test_a_scan_that_lacks_a_part_names_the_setting_that_makes_it_unnecessary(
-    name: str, write, clips: str, tmp_path: Path
-) -> None:
+def test_a_scan_that_lacks_a_part_names_the_setting_that_makes_it_unnecessary(name: str, write, tmp_path: Path) -> None:
     root = write(tmp_path / "raw")
     with pytest.raises(BadInput) as caught:
         _require_parts(get_adapter(name), root)
-    assert f"or set `{name}: {{clips: {clips}}}` under `convert.adapters` in params.yaml" in caught.value.remedy
-    _require_parts(get_adapter(name, clips=clips), root)
+    assert f"or set `{name}: {{clips: segments}}` under `convert.adapters` in params.yaml" in caught.value.remedy
+    _require_parts(get_adapter(name, clips="segments"), root)
     findings = check_adapter(get_adapter(name), root, load_embedded_hands(), sequences=1, worker=False)
     (parts,) = (item for item in findings if "every part" in item.rule)
-    assert parts.detail.endswith(f"; it is not needed with the setting clips={clips}")
+    assert parts.detail.endswith("; it is not needed with the setting clips=segments")
 
 
 def test_a_conversion_that_lacks_events_or_descriptions_names_the_setting_too(tmp_path: Path) -> None:

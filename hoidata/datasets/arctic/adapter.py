@@ -4,7 +4,7 @@ import re
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from hoidata.datasets.arctic.files import (
 )
 from hoidata.datasets.base import AdapterBase, DatasetPart, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.known_meshes import raw_mesh
-from hoidata.datasets.segments import segment_clips
+from hoidata.datasets.segments import ClipSource, has_description, segment_clips
 from hoidata.errors import BadInput
 from hoidata.files import load_npy_object
 from hoidata.geometry.rotations import canonical_rotvec
@@ -66,7 +66,6 @@ MOTION_PARTS = (
 )
 WITHHELD_SUBJECT = "s03"
 KINDS = ("mano.npy", "object.npy", "egocam.dist.npy", "smplx.npy")
-ClipSource = Literal["described", "whole", "segments", "described-else-segments"]
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ class ArcticAdapter(AdapterBase):
         archive = "Text2HOI's description files (linked from its and ARCTIC's page)"
         optional = self.clips != "described"
         descriptions = DatasetPart(
-            contents="segments and words",
+            contents="frame ranges and verbs",
             patterns=files,
             archive=archive,
             optional=optional,
@@ -130,9 +129,9 @@ class ArcticAdapter(AdapterBase):
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
         """One clip per described range of at least 20 frames, per segment, or per sequence."""
         path = _path_in_copy(raw, f"description/{key.name}/description.txt")
-        if self.clips in ("whole", "segments") or (self.clips != "described" and not raw.has(path)):
+        if not has_description(self.clips, raw, path):
             whole = self._whole(raw, key, _read_motion(raw, key, hands, self.body))
-            return [whole] if self.clips == "whole" else list(segment_clips(whole, hands))
+            return [whole] if self.clips == "whole" else list(segment_clips([whole], hands))
         descriptions, results = _read_descriptions(raw, path, key)
         motion = _read_motion(raw, key, hands, self.body)
         object_name = motion.object.model.name

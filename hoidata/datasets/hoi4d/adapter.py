@@ -7,7 +7,7 @@ Clips have 30 frames per second, of which every second one is interpolated (``pa
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,6 +41,7 @@ from hoidata.datasets.hoi4d.parts import (
     upsample_values,
 )
 from hoidata.datasets.known_meshes import raw_mesh
+from hoidata.datasets.segments import ClipSource, has_description, segment_clips
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import runs
 from hoidata.geometry.rotations import rotmat_to_rotvec
@@ -82,7 +83,6 @@ PARTS = (
     ),
 )
 EVENT_FILES = (f"{ANNOTATIONS}/{CLIP}/action/color.json",)
-ClipSource = Literal["described", "whole"]
 
 
 class _ObjectMotion(NamedTuple):
@@ -112,8 +112,7 @@ class Hoi4dAdapter(AdapterBase):
     facts = facts_of_adapter(__file__)
     margin_frames: int = 0  # at 30 fps: frames kept before and after each event
     shortest_frames: int = 20  # at 30 fps: shorter events give no clip
-    # "described": one clip per event of ``action/color.json`` that acts on the object; "whole": one clip per recording
-    clips: ClipSource = "described"
+    clips: ClipSource = "described"  # a described clip is an event of ``action/color.json`` that acts on the object
     # Frames in which two tracked parts are farther off their hinge are excluded.
     most_off_mm: int = 20
     most_off_deg: int = 10
@@ -123,13 +122,13 @@ class Hoi4dAdapter(AdapterBase):
     @property
     def parts(self) -> tuple[DatasetPart, ...]:
         """Files of a complete raw folder. Events are required for the setting ``clips: described`` only."""
-        optional = self.clips == "whole"
+        optional = self.clips != "described"
         events = DatasetPart(
             contents="events",
             patterns=EVENT_FILES,
             archive="HOI4D_annotations.zip",
             optional=optional,
-            unneeded_with="clips=whole",
+            unneeded_with="clips=segments",
         )
         return (*PARTS, events)
 
@@ -170,6 +169,8 @@ class Hoi4dAdapter(AdapterBase):
             camera=camera_track,
         )
         clips = self._cut(whole, camera_track.images, ranges, object_motion)
+        if self.clips != "whole" and not has_description(self.clips, raw, _events_path(key)):
+            clips = segment_clips(clips, hands)
         return [*results, *object_motion.rejected_frames, *unknown_events, *clips]
 
     def _cut(
@@ -197,13 +198,13 @@ class Hoi4dAdapter(AdapterBase):
 
     def _clip_ranges(self, raw: RawTree, key: SequenceKey, n_frames: int) -> tuple[list[_ClipRange], list[Quarantined]]:
         """Ranges that become clips, and reasons for events with an unknown word."""
-        if self.clips == "whole":
+        path = _events_path(key)
+        if not has_description(self.clips, raw, path):
             _, _, category, *_, task = key.name.split("/")
-            verb = TASKS.get((category, task))
+            verb = TASKS.get((category, task)) if self.clips == "whole" else None
             return [_ClipRange(str(key), start=0, stop=n_frames, verb=verb, hand=None)], []
-        path = f"{ANNOTATIONS}/{key.name}/action/color.json"
         if not raw.has(path) and path not in (raw.manifest or ()):
-            remedy = "unpack HOI4D_annotations.zip here, or set clips: whole, which needs no events"
+            remedy = "unpack HOI4D_annotations.zip here, or set clips: segments, which needs no events"
             raise BadInput(path, "a file with the events of the recording", "nothing there", remedy)
         ranges, unknown_events = dict[tuple[int, int], _ClipRange](), list[Quarantined]()
         for event in action_events(raw.read(path), path):
@@ -277,6 +278,10 @@ class Hoi4dAdapter(AdapterBase):
         rejected = [fit.rejected_frames_reason(f"{key}/hinge", location, frames, *limits)] if off.any() else []
         note = f"{fit.note}; {_box_note(ratio, aligned)}"
         return _object_motion(model, fit.world_from_object, fit.hinge_rad, frames, tracked, note, rejected)
+
+
+def _events_path(key: SequenceKey) -> str:
+    return f"{ANNOTATIONS}/{key.name}/action/color.json"
 
 
 def _category(key: SequenceKey) -> Category:

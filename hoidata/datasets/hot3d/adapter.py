@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from hoidata.datasets.gaps import (
 from hoidata.datasets.hinge import box_corners
 from hoidata.datasets.hot3d.files import HandFormat, Poses, object_words
 from hoidata.datasets.hot3d.sources import PARTS, Profile, Source, joints_m, read_source
+from hoidata.datasets.segments import segment_clips
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import Interval, bridged, runs, split_evenly, widened
 from hoidata.geometry.rotations import rotmat_to_rotvec
@@ -119,7 +120,8 @@ class Hot3dAdapter(AdapterBase):
     hands: HandFormat = "mano"  # "mano" falls back to UmeTrack without a MANO file; "umetrack" needs no MANO files
     margin_frames: int = 0  # frames that a clip keeps before and after its interval
     shortest_frames: int = 30  # shorter intervals give no clip
-    longest_frames: int = 150  # longer intervals are split evenly
+    longest_frames: int = 150  # longer intervals are split
+    clips: Literal["interactions", "segments"] = "interactions"  # long intervals are split evenly or into segments
     most_fit_error_mm: int = 10  # clips with a larger mean error of fitted hands are quarantined
     frame: WorldFrame = FRAME
     parts: tuple[DatasetPart, ...] = PARTS
@@ -163,6 +165,7 @@ class Hot3dAdapter(AdapterBase):
             sources=raw.sources,
         )
         items = list(self._cut(whole, recording, hands))
+        items = list(segment_clips(items, hands)) if self.clips == "segments" else items
         if not items:
             expected = f"a hand within {100 * TOUCH_M:g} cm of an object that moves"
             raise BadInput(key.name, expected, "none in any frame", "nothing to do if nobody moves anything")
@@ -246,7 +249,7 @@ class Hot3dAdapter(AdapterBase):
                 elif not _moves(recorded_object.track, interval):
                     intervals.still.append(touch)
                 else:
-                    pieces = split_evenly(interval, self.longest_frames)
+                    pieces = [interval] if self.clips == "segments" else split_evenly(interval, self.longest_frames)
                     intervals.clips.extend(trim_to_recorded(piece, recorded_object.tracked) for piece in pieces)
         return intervals
 

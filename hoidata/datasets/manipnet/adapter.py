@@ -8,6 +8,7 @@ Negating x of the world and of every joint frame makes the motion right-handed. 
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -41,8 +42,9 @@ from hoidata.datasets.manipnet.segments import (
     motion_verb,
     object_words,
 )
+from hoidata.datasets.segments import segment_clips
 from hoidata.errors import BadInput
-from hoidata.geometry.intervals import widened
+from hoidata.geometry.intervals import runs, widened
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair
 from hoidata.hands.fitting import fit_hands, fit_shape
@@ -138,6 +140,7 @@ class ManipNetAdapter(AdapterBase):
     facts = facts_of_adapter(__file__)
     # At 30 fps: usable frames kept before and after each interaction. Ids and verbs describe the interaction alone.
     margin_frames: int = 0
+    clips: Literal["interactions", "segments"] = "interactions"  # at most one lift each with its verb, or segments
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
     parts: tuple[DatasetPart, ...] = PARTS
@@ -148,29 +151,31 @@ class ManipNetAdapter(AdapterBase):
         return [SequenceKey(self.name, self.name, folder.name) for folder in folders]
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
-        """One clip per interaction of one sequence, and reasons for rejected intervals."""
+        """One clip per interaction or segment of one sequence, and reasons for rejected intervals."""
         recording = read_recording(raw, key.name)
         betas = fit_shape(recording.keypoints_m, hands)
         results: list[Clip | Quarantined] = [_rejected(key, *cut) for cut in recording.cuts]
         lift_m, centre_m, usable = recording.lift_m(), recording.centre_m(), recording.usable()
         nearest = np.minimum(*(distance.min(axis=1) for distance in recording.distances_m().values()))
-        for interval in interactions(usable, nearest < TOUCH_M, lift_m > LIFTED_M):
+        in_segments = self.clips == "segments"
+        intervals = runs(usable) if in_segments else interactions(usable, nearest < TOUCH_M, lift_m > LIFTED_M)
+        for interval in intervals:
             frames = slice(*interval)
             start, stop = (int(recording.source_frames[i]) for i in (interval.start, interval.stop - 1))
-            verb = motion_verb(lift_m[frames], centre_m[frames], recording.rotation[frames])
+            verb = None if in_segments else motion_verb(lift_m[frames], centre_m[frames], recording.rotation[frames])
             length = interval.stop - interval.start
             if length < SHORTEST_FRAMES:
                 ends = [frame for frame in (interval.start - 1, interval.stop) if 0 <= frame < len(usable)]
                 got = f"{length}" if usable[ends].all() else f"{length}, next to frames that are left out"
                 results.append(_rejected(key, start, stop + 1, f"{SHORTEST_FRAMES} frames or more", got))
-            elif verb is None:
+            elif verb is None and not in_segments:
                 results.append(_rejected(key, start, stop + 1, "an object that moves", "one that stays on the table"))
             else:
                 frames_with_margin = widened(interval, self.margin_frames, usable)
                 sources = raw.recorded(*recording.paths)
                 clip = self._clip(key, recording, frames_with_margin, betas, hands)
                 results.append(replace(clip, clip_id=_clip_id(key, start, stop), verb=verb, sources=sources))
-        return results
+        return list(segment_clips(results, hands)) if in_segments else results
 
     def recordings(self, raw: RawTree, key: SequenceKey) -> list[HandRecording]:
         """All frames with the 17-joint hands of the files; empty if the skin's file is missing or not listed."""

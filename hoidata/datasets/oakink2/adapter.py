@@ -31,8 +31,8 @@ from hoidata.datasets.oakink2.files import (
     read_names,
     read_program,
     read_roots,
-    verb_of,
 )
+from hoidata.datasets.segments import ClipSource, has_description, segment_clips
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import runs
 from hoidata.geometry.rotations import rotmat_to_rotvec
@@ -55,7 +55,6 @@ CONVENTION = HandConvention(
 )
 PARTS = (
     DatasetPart("motion of hands and objects", tuple(f"{name}/*.pkl" for name in ANNOTATIONS), "anno_preview"),
-    DatasetPart("programs", (f"{PROGRAM}/*.json",), "program.tar"),
     DatasetPart(
         "object meshes",
         tuple(f"{name}/align_ds/*/*.{suffix}" for name in OBJECTS for suffix in ("obj", "ply")),
@@ -64,6 +63,7 @@ PARTS = (
     DatasetPart("names of objects", tuple(f"{name}/obj_desc.json" for name in OBJECTS), "object_repair.tar"),
     DatasetPart("parts of objects", (TREE,), "object_affordance.tar", optional=True),
 )
+PROGRAMS = DatasetPart("programs", (f"{PROGRAM}/*.json",), "program.tar", unneeded_with="clips=segments")
 
 
 class SceneObject(NamedTuple):
@@ -80,7 +80,8 @@ class SceneObject(NamedTuple):
 class Oakink2Adapter(AdapterBase):
     """Raw root: ``anno_preview``, ``program``, ``object_repair`` (or ``object_raw``), ``object_affordance``.
 
-    Recordings are named as in the source, with ``/`` for ``++``.
+    Recordings are named as in the source, with ``/`` for ``++``. A described clip is a primitive of the program.
+    Without a program, each named object gives clips, without other objects.
     """
 
     facts = facts_of_adapter(__file__)
@@ -90,9 +91,14 @@ class Oakink2Adapter(AdapterBase):
     # the frames are not joined.
     most_off_mm: int = 20
     most_off_deg: int = 10
+    clips: ClipSource = "described"
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
-    parts: tuple[DatasetPart, ...] = PARTS
+
+    @property
+    def parts(self) -> tuple[DatasetPart, ...]:
+        """Files of a complete raw folder. Programs are required for the setting ``clips: described`` only."""
+        return (*PARTS, replace(PROGRAMS, optional=self.clips != "described"))
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per annotation. The subject is the suffix of the scene's name, ``A001`` of ``scene_01__A001``."""
@@ -106,7 +112,8 @@ class Oakink2Adapter(AdapterBase):
         paths = [f"{folder}/{token}.pkl" for folder in ANNOTATIONS]
         path = next((candidate for candidate in paths if raw.has(candidate)), paths[0])
         annotation = read_annotation(raw.read(path), path)
-        program = read_program(raw.read(program_path := f"{PROGRAM}/{token}.json", MAX_JSON_BYTES), program_path)
+        program_path = f"{PROGRAM}/{token}.json"
+        has_program = has_description(self.clips, raw, program_path)
         names, roots = object_names(raw)
         scene = Scene(
             raw=raw,
@@ -122,14 +129,19 @@ class Oakink2Adapter(AdapterBase):
             side: to_track(annotation.hands[side], CONVENTION, hands[side]) for side in SIDES
         }
         results = list[Clip | Quarantined]()
-        for segment in program:
-            objects = scene.objects_of(segment.objects)
+        if has_program:
+            program = read_program(raw.read(program_path, MAX_JSON_BYTES), program_path)
+            actions = [(segment, scene.objects_of(segment.objects)) for segment in program]
+        else:
+            actions = [(_whole(annotation, item), [item]) for item in scene.objects_of(list(annotation.parts))]
+        described_in = program_path if has_program else path
+        for segment, objects in actions:
             reason = _unusable_reason(segment, objects)
             if reason is not None:
                 expected, got = reason
                 name = f"{key}/{segment.name}"
                 results.append(
-                    Quarantined(name, where=program_path, expected=expected, got=got, remedy="nothing to do")
+                    Quarantined(name, where=described_in, expected=expected, got=got, remedy="nothing to do")
                 )
                 continue
             whole = Clip(
@@ -141,7 +153,7 @@ class Oakink2Adapter(AdapterBase):
                 object=objects[0].track,
                 source_frames=annotation.frames.astype(np.int32),
                 gravity=None,
-                verb=verb_of(segment.primitive),
+                verb=segment.verb,
                 object_words=str(objects[0].words),
                 labelled_hand=segment.hand,
                 other_objects=tuple(other.track for other in objects[1:]),
@@ -150,12 +162,13 @@ class Oakink2Adapter(AdapterBase):
                     [GRAVITY_NOTE, *(scene_object.note for scene_object in objects if scene_object.note)]
                 ),
             )
-            results += self._cut(whole, program_path, segment.span, objects)
+            clips = self._cut(whole, described_in, segment.span, objects)
+            results += clips if has_program or self.clips == "whole" else segment_clips(clips, hands)
         results += scene.rejected_frames
         return [replace(item, sources=raw.sources) if isinstance(item, Clip) else item for item in results]
 
     def _cut(
-        self, whole: Clip, program_path: str, span: Range, objects: list[SceneObject]
+        self, whole: Clip, described_in: str, span: Range, objects: list[SceneObject]
     ) -> Iterator[Clip | Quarantined]:
         """One clip per interval of a primitive in which all its objects have poses. span: frames at 120 Hz."""
         frames, margin = whole.source_frames, self.margin_frames * STEP
@@ -166,22 +179,28 @@ class Oakink2Adapter(AdapterBase):
         intervals = [trim_to_recorded(piece, recorded) for piece in runs(inside & all_have_pose)]
         for scene_object in objects:
             name, tracked = scene_object.track.model.name, scene_object.tracked[inside]
-            yield from missing_poses(f"{whole.clip_id}/missing {name}", program_path, name, frames[inside], tracked)
+            yield from missing_poses(f"{whole.clip_id}/missing {name}", described_in, name, frames[inside], tracked)
         accepted = [piece for piece in intervals if piece.stop - piece.start >= self.shortest_frames]
         if not accepted:
             got = f"{max((b - a for a, b in intervals), default=0)} in mocap frames {span[0]} to {span[1] - 1}"
             expected = f"{self.shortest_frames} frames (at 30 per second) with the objects"
             remedy = "nothing to do, or lower shortest_frames"
-            yield Quarantined(whole.clip_id, where=program_path, expected=expected, got=got, remedy=remedy)
+            yield Quarantined(whole.clip_id, where=described_in, expected=expected, got=got, remedy=remedy)
         for start, stop in accepted:
             suffix = "" if len(accepted) == 1 else f"/{frames[start]:06d}"
             clip = replace(whole.take(slice(start, stop)), clip_id=f"{whole.clip_id}{suffix}")
             yield replace(clip, source_frames=mark_interpolated(frames[start:stop], recorded[start:stop]))
 
 
+def _whole(annotation: Annotation, item: SceneObject) -> Segment:
+    """An object over the whole recording."""
+    span = int(annotation.frames[0]), int(annotation.frames[-1]) + 1
+    return Segment(left=span, right=span, primitive=None, objects=(item.track.model.name,))
+
+
 def _unusable_reason(segment: Segment, objects: list[SceneObject]) -> tuple[str, str] | None:
     """Expected and actual, if a primitive cannot be a clip; else None."""
-    if verb_of(segment.primitive) is None:
+    if segment.primitive is not None and segment.verb is None:
         return "a primitive with a name", repr(segment.primitive)[:40]
     if not objects:
         return "poses of an object of the primitive", f"none of {', '.join(segment.objects) or 'no objects'}"[:80]

@@ -118,12 +118,17 @@ class Annotation(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """One primitive of a program."""
+    """One primitive of a program, or an object over the whole recording."""
 
     left: Range | None  # frames at 120 Hz of the left hand, half-open; None if it is not involved
     right: Range | None
-    primitive: str
+    primitive: str | None  # None: the whole recording
     objects: tuple[str, ...]  # ids of the parts involved, the leading hand's first
+
+    @property
+    def verb(self) -> str | None:
+        """None if the source does not state it."""
+        return None if self.primitive is None else verb_of(self.primitive)
 
     @property
     def span(self) -> Range:
@@ -132,13 +137,17 @@ class Segment(NamedTuple):
         return min(starts), max(stops)
 
     @property
-    def hand(self) -> HandType:
-        """The hands that are involved."""
+    def hand(self) -> HandType | None:
+        """The hands that are involved; None if the source does not state them."""
+        if self.primitive is None:
+            return None
         return "both" if self.left and self.right else "left" if self.left else "right"
 
     @property
     def name(self) -> str:
-        """Unique name in the recording: ``left-1595-2340``, or both hands' ranges."""
+        """Unique name in the recording: ``left-1595-2340``, both hands' ranges, or the object."""
+        if self.primitive is None:
+            return self.objects[0]
         ranges = {"left": self.left, "right": self.right}
         return "-".join(f"{side}-{hand_range[0]}-{hand_range[1]}" for side, hand_range in ranges.items() if hand_range)
 

@@ -6,6 +6,11 @@ import numpy as np
 import pytest
 
 from hoidata.clips import SIDES, Clip, Side
+from hoidata.clips.quarantine import Quarantined
+from hoidata.clips.validation import check_clip
+from hoidata.contact.settings import ContactSettings
+from hoidata.datasets import RawTree, get_adapter
+from hoidata.datasets import segments as cutting
 from hoidata.datasets.segments import (
     LONGEST_FRAMES,
     MARGIN_FRAMES,
@@ -15,9 +20,10 @@ from hoidata.datasets.segments import (
     object_signals,
     segment_clips,
 )
-from hoidata.hands import load_embedded_hands
+from hoidata.hands import HandPair, load_embedded_hands, track_joints
 from hoidata.store.hand_evidence import HandEvidence
-from tests.builders.clips import build_clip, clip_of, still_object, with_object
+from tests.builders import arctic, hoi4d, hot3d, manipnet, oakink2
+from tests.builders.clips import build_clip, clip_of, flat_hand, still_object, with_object
 from tests.builders.objects import box_model, hinged_box
 
 RAMP = np.linspace(0, 1, 40)
@@ -121,11 +127,105 @@ def test_noise_of_a_tracker_is_no_motion_and_the_signals_do_not_depend_on_the_wo
 
 def test_segments_are_clips_with_the_frames_in_their_ids():
     clip = build_clip(n_frames=400, seed=3)
-    clips = segment_clips(clip, load_embedded_hands())
+    clips = list(segment_clips([clip], load_embedded_hands()))
     assert len(clips) > 1
     assert [item.clip_id for item in clips] == [
         f"{clip.clip_id}/{item.source_frames[0] + 1:04d}-{item.source_frames[-1] + 1:04d}" for item in clips
     ]
     assert sum(item.n_frames for item in clips) == 400
     short = build_clip(n_frames=LONGEST_FRAMES)
-    assert segment_clips(short, load_embedded_hands()) == [short]
+    assert list(segment_clips([short], load_embedded_hands())) == [short]
+
+
+def test_a_recording_that_no_hand_comes_near_is_quarantined():
+    (reason,) = segment_clips(
+        [replace(build_clip(), hands={side: flat_hand(np.full((30, 3), 9.0)) for side in SIDES})], load_embedded_hands()
+    )
+    assert isinstance(reason, Quarantined)
+    assert (reason.expected, reason.got) == ("a hand within 2 cm of the object", "none in any frame")
+
+
+def test_a_segment_begins_and_ends_with_a_recorded_frame():
+    whole = build_clip(n_frames=400, seed=3)
+    every_second = replace(whole, source_frames=(np.arange(400) // 2).astype(np.int32))
+    clips = list(segment_clips([every_second], load_embedded_hands()))
+    assert len(clips) > 1
+    for clip in clips:
+        position = np.flatnonzero((whole.object.translation_m == clip.object.translation_m[0]).all(axis=1))
+        assert set(position % 2) == {0}
+        assert clip.recorded[-1]
+
+
+ADAPTERS = {
+    "arctic": (arctic.write_two, True),
+    "hoi4d": (hoi4d.write_two, True),
+    "hot3d": (hot3d.write_two, False),
+    "manipnet": (lambda root: manipnet.write_tree(root, *manipnet.lift_rows(480)), False),
+    "oakink2": (oakink2.write_two, True),
+}
+
+
+@pytest.mark.parametrize("name", ADAPTERS)
+def test_adapters_of_long_recordings_cut_them_into_segments(name, tmp_path, monkeypatch):
+    """The recordings of these trees are short, so segments are made shorter. Hands touch from 30 cm."""
+    longest = 18
+    monkeypatch.setattr(cutting, "LONGEST_FRAMES", longest)
+    monkeypatch.setattr(cutting, "SHORTEST_FRAMES", 6)
+    monkeypatch.setattr(cutting, "ContactSettings", lambda: ContactSettings(threshold_m=0.3))
+    write, has_descriptions = ADAPTERS[name]
+    write(tmp_path)
+    hands, raw = load_embedded_hands(), RawTree(tmp_path)
+    keys = get_adapter(name).sequences(tmp_path)
+    clips = clips_of(get_adapter(name, clips="segments"), raw, keys, hands)
+    assert len(clips) > len(keys)
+    assert len({clip.clip_id for clip in clips}) == len(clips)
+    for clip in clips:
+        check_clip(clip)
+        assert clip.n_frames <= longest
+        assert clip.verb is None
+        assert clip.labelled_hand is None
+    again = clips_of(get_adapter(name, clips="segments"), raw, keys, hands)
+    assert [clip.clip_id for clip in again] == [clip.clip_id for clip in clips]
+    for recording in clips_of(
+        get_adapter(name, clips="whole" if has_descriptions else "interactions"), raw, keys, hands
+    ):
+        parts = [clip for clip in clips if part_of(clip) == part_of(recording)]
+        covered = np.isin(recording.source_frames, np.concatenate([[-1], *(clip.source_frames for clip in parts)]))
+        near = near_frames(recording, hands)
+        assert (near & covered).sum() >= 0.9 * near.sum()
+
+
+@pytest.mark.parametrize(
+    ("name", "descriptions"),
+    [("arctic", "description.txt"), ("hoi4d", "action/color.json"), ("oakink2", "program_info/*.json")],
+)
+def test_only_a_recording_without_a_description_falls_back_to_segments(name, descriptions, tmp_path):
+    ADAPTERS[name][0](tmp_path)
+    hands, keys = load_embedded_hands(), get_adapter(name).sequences(tmp_path)
+
+    def ids(clips: str) -> list[str]:
+        return [clip.clip_id for clip in clips_of(get_adapter(name, clips=clips), RawTree(tmp_path), keys, hands)]
+
+    described = ids("described")
+    assert described
+    assert ids("described-else-segments") == described
+    for path in tmp_path.rglob(descriptions):
+        path.unlink()
+    assert ids("described-else-segments") == ids("segments") != described
+
+
+def clips_of(adapter, raw: RawTree, keys: list, hands: HandPair) -> list[Clip]:
+    return [item for key in keys for item in adapter.load(raw, key, hands) if isinstance(item, Clip)]
+
+
+def part_of(clip: Clip) -> tuple[str, str]:
+    return clip.sequence, clip.object.model.name
+
+
+def near_frames(clip: Clip, hands: HandPair) -> np.ndarray:
+    """(frame,) bool: a joint is within 30 cm of a vertex of the object."""
+    vertices_m = clip.object.points_in_world(clip.object.model.vertices_m, clip.object.model.part)
+    joints_m = np.concatenate([track_joints(clip.hands[side], hands[side]) for side in SIDES], axis=1)
+    valid = np.repeat(np.stack([clip.hands[side].valid for side in SIDES], axis=1), 21, axis=1)
+    distance_m = np.linalg.norm(joints_m[:, :, None] - vertices_m[:, None], axis=-1).min(axis=2)
+    return np.any((distance_m < 0.3) & valid, axis=1)

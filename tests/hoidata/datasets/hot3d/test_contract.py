@@ -82,6 +82,7 @@ class TestHot3d(AdapterContract):
         "longest_frames": (0, "1 or more"),
         "most_fit_error_mm": (True, "0 or more"),
         "hands": ("both", "mano or umetrack"),
+        "clips": ("all", "interactions or segments"),
     }
     conventions = {  # noqa: RUF012
         "unit": "test_files_are_in_metres_and_the_profile_in_millimetres",

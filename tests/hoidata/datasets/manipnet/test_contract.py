@@ -52,7 +52,7 @@ class TestManipNet(AdapterContract):
     corrupted_sequence = "manipnet/tetra_large7"
     write = staticmethod(manipnet.write_two)
     common_sources = True
-    bad_settings = {"margin_frames": (-1, "0 or more")}  # noqa: RUF012
+    bad_settings = {"margin_frames": (-1, "0 or more"), "clips": ("all", "interactions or segments")}  # noqa: RUF012
     conventions = {  # noqa: RUF012
         "unit": "test_a_unit_is_a_decimetre",
         "handedness of the world": "test_the_world_is_seen_in_a_mirror_with_normal_x",

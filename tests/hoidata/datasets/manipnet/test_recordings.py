@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from hoidata.clips.clip import SIDES, Clip
-from hoidata.datasets.base import RawTree
+from hoidata.datasets.base import RawTree, SequenceKey
 from hoidata.datasets.manipnet.adapter import ManipNetAdapter, Recording, read_recording, surface_distances
 from hoidata.datasets.manipnet.segments import LIFTED_M, TOUCH_M
 from hoidata.errors import BadInput
@@ -27,6 +27,24 @@ def test_fitted_hands_keep_joints_tips_and_touch_in_all_five_sequences() -> None
     assert (figures["tip_error_mm"] <= 3).all(), figures.to_string()
     assert (figures["lifted_near_share"] >= 0.95).all(), figures.to_string()
     assert (figures["clips"] >= 5).all(), figures.to_string()
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not ROOT, reason="HOIDATA_MANIPNET is not set: the recordings are not part of this repository")
+@pytest.mark.parametrize("name", ["cup1", "teapot2"])
+def test_segments_of_a_recording_cover_its_contact_and_are_stable(name: str) -> None:
+    hands, raw, key = load_embedded_hands(), RawTree(Path(ROOT)), SequenceKey("manipnet", "manipnet", name)
+    clips, again = (
+        [item for item in ManipNetAdapter(clips="segments").load(raw, key, hands) if isinstance(item, Clip)]
+        for _ in range(2)
+    )
+    assert [clip.clip_id for clip in clips] == [clip.clip_id for clip in again]
+    assert max(clip.n_frames for clip in clips) <= 150
+    recording = read_recording(raw, name)
+    near = np.minimum(*(distance.min(axis=1) for distance in recording.distances_m().values())) < TOUCH_M
+    covered = np.isin(recording.source_frames, np.concatenate([clip.source_frames for clip in clips]))
+    near &= recording.usable()
+    assert (near & covered).sum() >= 0.9 * near.sum() > 0
 
 
 def measure_fits(root: Path, hands: HandPair) -> pd.DataFrame:
