@@ -13,13 +13,9 @@ from pathlib import Path
 import pytest
 
 from pipelines.stages.code import code_today
+from tests.builders.wheel import OURS, build_wheel
 
 PROJECT = Path(__file__).parents[1]
-OURS = ("hoidata", "models", "pipelines")
-BESIDE = (
-    *("pyproject.toml", "setup.py", "dvc.yaml", "params.yaml", "prefect.toml", "manifests", "README.md", "NOTICE"),
-    *("LICENSE*", ".dvc", ".dvcignore", ".gitignore"),
-)
 # Packages of the user, unrelated to hoidata.
 USERS = "from models import mine\nfrom pipelines import own\nimport hoidata.errors\nprint(mine, own)"
 BOTH = "import models\nfrom hoidata.package_paths import add_to_path\nadd_to_path()"
@@ -36,16 +32,9 @@ def run(python: Path, folder: Path, *words: str, **more: str) -> subprocess.Comp
 def python(tmp_path_factory) -> Path:
     """The Python of an environment with the wheel and the packages of this environment."""
     folder = tmp_path_factory.mktemp("installed")
-    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", "--", *OURS, *BESIDE]
-    files = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=True).stdout
-    for name in filter(None, files.split("\0")):
-        (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(PROJECT / name, folder / "source" / name)
-    build = f"from setuptools.build_meta import build_wheel; build_wheel({str(folder)!r})"
-    subprocess.run([sys.executable, "-c", build], cwd=folder / "source", check=True, capture_output=True)
+    wheel = build_wheel(folder)
     venv.create(folder / "env", with_pip=True)
     python = folder / "env/bin/python"
-    (wheel,) = folder.glob("*.whl")
     done = run(python, folder, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", str(wheel))
     assert done.returncode == 0, done.stderr
     (packages,) = (folder / "env").glob("lib/python*/site-packages")
