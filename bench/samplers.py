@@ -1,22 +1,23 @@
-"""CPU time of one Text2HOI motion: strided samplers, tokens without padding, guidance in one call.
+"""CPU time of one Text2HOI motion: strided samplers, and tokens without padding.
 
 ``python -m bench samplers``. The baseline is ``nn.TransformerEncoder`` of the same size over all 451 tokens with a
 mask. Its 1,000 calls are extrapolated from a few. Weights are random.
 """
 
-import copy
 import time
 from collections.abc import Callable
-from typing import get_args
 
+import numpy as np
 import torch
+import trimesh
 from torch import Tensor, nn
 
 from bench.harness import medians, show
-from models.common.precision import SamplingPrecision, compute_in
+from hoidata.batches.requests import ObjectPoints, Request, collate_requests
+from hoidata.objects.model import ObjectModel
 from models.common.sampling import SamplerConfig, sample_motion
 from models.common.transformer import TransformerConfig
-from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, guided
+from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
 
 FRAMES, STOCK_STEPS, RUNS = 150, 1000, 3
 
@@ -27,7 +28,6 @@ def main() -> None:
     model, stock = DiffusionModel(DiffusionConfig(size)).eval(), stock_encoder(size)
     calls: dict[str, Callable[[], object]] = {
         "both hands, 150 frames": one_call(model, (True, True), FRAMES),
-        "the same, guided": one_call(model, (True, True), FRAMES, guidance=2.0),
         "one hand, 60 frames": one_call(model, (False, True), 60),
         "stock encoder, 451 tokens masked": stock_call(stock, size, 60),
     }
@@ -45,13 +45,6 @@ def main() -> None:
             seconds = motion_s(model, SamplerConfig(kind, steps))
             rows.append([f"{kind}, {steps} steps", f"{seconds:.1f}", f"{stock_s / seconds:.0f}"])
         show("One motion of 150 frames and both hands", ["sampler", "processor s", "speed-up"], rows)
-        exact = run(model, SamplerConfig("dpm++", 10))
-        for precision in get_args(SamplingPrecision)[1:]:
-            lower = copy.deepcopy(model)
-            compute_in(lower, precision)
-            difference = (run(lower, SamplerConfig("dpm++", 10)) - exact)[..., :3].abs().max()
-            moved = 1e3 * float(difference)
-            print(f"{precision} in the Transformer moves wrists by up to {moved:.2f} (thousandths of a unit)")
 
 
 def stock_encoder(size: TransformerConfig) -> nn.TransformerEncoder:
@@ -74,35 +67,27 @@ def stock_call(stock: nn.TransformerEncoder, size: TransformerConfig, n_frames: 
 
 
 def condition(active: tuple[bool, bool], frames: int) -> Condition:
-    points = torch.randn(1, 1024, 3) * 0.05
-    return Condition(
-        text=torch.randn(1, 512),
-        object=torch.randn(1, 1024),
-        points_m=points,
-        normals=torch.randn(1, 1024, 3),
-        part=torch.zeros(1, 1024, dtype=torch.long),
-        contact=torch.zeros(1, 2, 1024, dtype=torch.bool),
-        active_hands=torch.tensor([active]),
-        lengths=torch.tensor([frames]),
-        counts=(frames,),
-        sides=active,
-    )
+    mesh, random = trimesh.creation.box((0.1, 0.1, 0.1)), np.random.default_rng(0)
+    model = ObjectModel("box", np.asarray(mesh.vertices), np.asarray(mesh.faces), np.zeros(8, np.uint8))
+    points_m, normals = random.normal(0, 0.05, (2, 1024, 3)).astype(np.float32)
+    points = ObjectPoints(points_m, normals, np.zeros(1024, np.uint8))
+    text = random.normal(size=512).astype(np.float32)
+    batch = collate_requests([Request("box", model, points, text, np.array(active), frames)])
+    return Condition(batch, batch.text, [None], torch.zeros(1, 2, 1024))
 
 
-def one_call(
-    model: DiffusionModel, active: tuple[bool, bool], frames: int, guidance: float = 1.0
-) -> Callable[[], tuple[Tensor, Tensor]]:
-    denoise = guided(model, condition(active, frames), guidance)
+def one_call(model: DiffusionModel, active: tuple[bool, bool], frames: int) -> Callable[[], tuple[Tensor, Tensor]]:
+    encoded = model.encode_condition(condition(active, frames))
     hands, objects, steps = torch.randn(1, 2, frames, 99), torch.randn(1, frames, 10), torch.full((1,), 500)
-    return lambda: denoise(hands, objects, steps)
+    return lambda: model.denoise(hands, objects, steps, encoded)
 
 
 def run(model: DiffusionModel, config: SamplerConfig) -> Tensor:
     """Sample the hands of one motion from fixed noise."""
     generator = torch.Generator().manual_seed(0)
-    torch.manual_seed(1)
     noise = torch.randn(1, 2, FRAMES, 99, generator=generator), torch.randn(1, FRAMES, 10, generator=generator)
-    return sample_motion(guided(model, condition((True, True), FRAMES), 1.0), noise, config, generator)[0]
+    encoded = model.encode_condition(condition((True, True), FRAMES))
+    return sample_motion(lambda *inputs: model.denoise(*inputs, encoded), noise, config, generator)[0]
 
 
 def motion_s(model: DiffusionModel, config: SamplerConfig) -> float:

@@ -8,8 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from hoidata.actions.action import written_limits
-from hoidata.annotation.encoders import TextEncoder, load_encoder
+from hoidata.annotation.encoders import TextEncoder, load_encoder, not_clip_note
+from hoidata.annotation.sentence_check import further_verbs, read_sentence
 from hoidata.annotation.settings import AnnotationSettings
+from hoidata.annotation.vocabulary import Vocabulary
+from hoidata.annotation.wording import Wording, understood_words
 from hoidata.contact.settings import ContactSettings
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
@@ -19,12 +22,8 @@ from hoidata.settings import build_config
 from hoidata.store.store import open_store
 from models.common.checkpoints import FILE_NAME, read_info
 from models.common.repeatable import make_repeatable
-from models.common.vocabulary import Vocabulary
-from models.text2hoi.family import NAMES
 from models.text2hoi.generation import GeneratedMotion, Generator, MotionOptions
 from models.text2hoi.sampler import SamplingConfig
-from models.text2hoi.sentences import further_verbs, read_sentence
-from models.text2hoi.wording import Wording, understood_words
 from pipelines.command_inputs import MeshOptions, WrittenFiles, mesh_notes, stored_object
 from pipelines.pages.generation_page import write_generation
 from pipelines.params import chosen_params, read_file
@@ -53,9 +52,10 @@ class GenerationRequest:
     datasets: tuple[str, ...] = ()
     model: str = ""  # the dataset whose models to use; "" chooses it by the words of the sentence
     models: Models | None = None  # used instead of the project's models
-    wish: MotionOptions = field(default_factory=MotionOptions)
+    options: MotionOptions = field(default_factory=MotionOptions)
     mesh: MeshOptions = field(default_factory=MeshOptions)
     sampler: Mapping[str, Any] = field(default_factory=dict)  # fields of SamplerConfig that replace the models' own
+    sampling: Mapping[str, Any] = field(default_factory=dict)  # likewise of SamplingConfig
     force: bool = False  # generate even if the sentence has unknown words, and keep those words
 
 
@@ -80,16 +80,23 @@ def generate_files(request: GenerationRequest, out: Path) -> WrittenFiles:
     hands = models.hands
     model = user.model if user else _stored_object(str(request.object), models)
     notes += _missing_hinge_notes(verb, request.object, model)
-    sampling = replace(models.sampling, sampler=replace(models.sampling.sampler, **request.sampler))
-    generator = Generator.load(models.checkpoints, hands, models.encoder, sampling=sampling, points=models.points)
-    motions = generator.generate(wording.text, model, request.wish, noun if user else None)
+    generator = Generator.load(
+        models.checkpoints,
+        hands,
+        models.encoder,
+        sampling=replace(models.sampling, **request.sampling),
+        points=models.points,
+    )
+    generator = replace(generator, model=generator.model.with_sampler(**request.sampler))
+    motions = generator.generate(wording.text, model, request.options, noun if user else None)
     evidence, hand = motions[0].evidence, motions[0].evidence["hand"]
     if hand["source"] != "rule":
         notes.append(f"hand: {hand['hand']}, since {hand['evidence']} (--hand chooses another)")
-    if evidence["read_as"] is None:  # only networks without a verb classifier see the unknown words
+    if generator.model.is_paper and (note := not_clip_note(str(generator.encoder.identity["name"]))):
+        notes.append(note)
+    if evidence["verb"] is None:
         notes += [f"never seen: {note}" for note in evidence["unseen"]]
-    notes += _further_verb_notes(wording.text, evidence["read_as"], verb, generator.vocabulary)
-    notes += [*_classified_verb_notes(verb, evidence), *_fault_notes(motions)]
+    notes += [*_further_verb_notes(wording.text, verb, generator.vocabulary), *_fault_notes(motions)]
     return WrittenFiles(write_generation(out, motions, hands, str(models.checkpoints), notes), notes)
 
 
@@ -125,24 +132,13 @@ def _names(request: GenerationRequest) -> tuple[str]:
     return (request.object.stem if isinstance(request.object, Path) else request.object,)
 
 
-def _further_verb_notes(
-    text: str, read_as: tuple[str, float] | None, verb: str | None, vocabulary: Vocabulary
-) -> list[str]:
+def _further_verb_notes(text: str, verb: str | None, vocabulary: Vocabulary) -> list[str]:
     """A note that names the verbs of the sentence which the motion does not show: a motion has one verb."""
-    generated_verb = read_as[0] if read_as else verb
-    further = further_verbs(text, generated_verb, vocabulary)
-    if generated_verb is None or not further:
+    further = further_verbs(text, verb, vocabulary)
+    if verb is None or not further:
         return []
     others = ", ".join(map(repr, further))
-    return [f"a motion shows one action: this one shows {generated_verb!r}, not {others}; generate each alone"]
-
-
-def _classified_verb_notes(verb: str | None, evidence: Mapping[str, Any]) -> list[str]:
-    """A note if the verb classifier reads another verb than the sentence has."""
-    read_as = evidence["read_as"]
-    if not read_as or read_as[0] == verb:
-        return []
-    return [f"the sentence is classified as {read_as[0]!r} ({read_as[1]:.0%})"]
+    return [f"a motion shows one action: this one shows {verb!r}, not {others}; generate each alone"]
 
 
 def _fault_notes(motions: Sequence[GeneratedMotion]) -> list[str]:
@@ -166,10 +162,12 @@ def _profile_settings(profile: str) -> tuple[TextEncoder, int, SamplingConfig]:
     params = chosen_params({**read_file(Path("params.yaml")), "profile": profile})
     encoder = build_config(AnnotationSettings, params.get("annotate"), "params.yaml: annotate").encoder
     points = build_config(ContactSettings, params.get("contact"), "params.yaml: contact").points
+    return load_encoder(encoder), points, _sampling_settings(params)
+
+
+def _sampling_settings(params: Mapping[str, Any]) -> SamplingConfig:
     section = (params.get("sample") or {}).get("text2hoi")
-    sampling = build_config(SamplingConfig, section, "params.yaml: sample.text2hoi")
-    # Half precision is slow on the CPU, where this runs.
-    return load_encoder(encoder), points, replace(sampling, precision="float32")
+    return build_config(SamplingConfig, section, "params.yaml: sample.text2hoi")
 
 
 def _clips_with(request: GenerationRequest, paths: StagePaths) -> Path:
@@ -189,11 +187,12 @@ def trained_runs(request: GenerationRequest) -> list[StagePaths]:
     """The requested datasets that have models. Raises MissingResource if none has."""
     names = (request.model,) if request.model else request.datasets
     runs = [StagePaths(request.profile, name) for name in names]
-    reasons = {paths: why_not_trained(paths) for paths in runs}
+    networks = _networks(request)
+    reasons = {paths: why_not_trained(paths, networks) for paths in runs}
     trained = [paths for paths in runs if not reasons[paths]]
     if not trained:
         reason = "; ".join(f"{paths}: {reasons[paths]}" for paths in runs)
-        others = [name for name in request.datasets if not why_not_trained(StagePaths(request.profile, name))]
+        others = [name for name in request.datasets if not why_not_trained(StagePaths(request.profile, name), networks)]
         alternative = f"; these datasets have models: {', '.join(others)}" if others else ""
         raise MissingResource(f"no models that can generate: {reason}{alternative}")
     return trained
@@ -232,9 +231,17 @@ def _has_object(paths: StagePaths, name: str | Path) -> bool:
     return name in list(open_store(paths.clips, load_hands(paths.profile)).objects["object"])
 
 
-def why_not_trained(paths: StagePaths) -> str | None:
-    """The first of the four networks of a dataset that is missing, in words; None if all are present."""
-    for name in NAMES:
+def _networks(request: GenerationRequest) -> list[str]:
+    """The networks that a request needs: the refiner and the length network only if they are used."""
+    params = chosen_params({**read_file(Path("params.yaml")), "profile": request.profile})
+    refine = request.sampling.get("refine", _sampling_settings(params).refine)
+    used = {"length": request.options.frames is None, "refiner": refine == "network"}
+    return [name for name in ("contact", "diffusion", "length", "refiner") if used.get(name, True)]
+
+
+def why_not_trained(paths: StagePaths, networks: Sequence[str]) -> str | None:
+    """The first of ``networks`` that is missing for a dataset, in words; None if all are present."""
+    for name in networks:
         folder = paths.checkpoints / name
         if reason := empty_reason(folder):
             return f"{name} is empty, {reason}"

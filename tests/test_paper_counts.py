@@ -135,7 +135,7 @@ class TestText2Hoi:
         assert (HAND_FEATURES, OBJECT_FEATURES, MAX_FRAMES) == (3 + 16 * 6, 3 + 6 + 1, 150)
 
     def test_contact_and_distances_end_at_2_centimetres(self):
-        """Sections 3.2 and 3.3 name the threshold tau; its value is that of the authors' code."""
+        """Section 3.2.3 and the supplement, section 6: the threshold tau is 2 cm."""
         assert ContactSettings() == ContactSettings(points=1024, threshold_m=0.02)
 
     def test_noise_has_1000_steps(self):
@@ -167,6 +167,7 @@ class TestText2Hoi:
             points_m=torch.rand(1, 1024, 3),
             normals=torch.rand(1, 1024, 3),
             part=torch.zeros(1, 1024, dtype=torch.long),
+            scale_m=torch.ones(1),
             contact=torch.zeros(1, 2, 1024),
             active_hands=torch.ones(1, 2, dtype=torch.bool),
             lengths=torch.tensor([150]),

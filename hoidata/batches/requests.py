@@ -71,6 +71,7 @@ class RequestBatch:
     points_m: Tensor  # (B, N, 3)
     normals: Tensor  # (B, N, 3)
     part: Tensor  # (B, N)
+    scale_m: Tensor  # (B,) ``ObjectModel.scale_m``
     active_hands: Tensor  # (B, 2) bool
     frames: Tensor  # (B, F) bool: False for padding
     lengths: Tensor  # (B,)
@@ -118,6 +119,7 @@ def conditions(items: Sequence[Any], objects: Sequence[ObjectModel], lengths: np
         "points_m": np.stack([item.points.points_m for item in items]),
         "normals": np.stack([item.points.normals for item in items]),
         "part": np.stack([item.points.part for item in items]).astype(np.int64),
+        "scale_m": np.array([model.scale_m for model in objects], np.float32),
         "active_hands": np.stack([item.active_hands for item in items]),
         "frames": np.arange(lengths.max()) < lengths[:, None],
         "lengths": lengths,

@@ -81,7 +81,7 @@ METRICS: tuple[Metric, ...] = (
     ),
     Metric(
         "contact_f1", touch.contact_f1, topic="Contact", title="F1 of the contact map", direction="higher",
-        frames=WHOLE, thresholds=CONTACT, source="Text2HOI (Cha et al. 2024), Sec. 3.2.2: the map",
+        frames=WHOLE, thresholds=CONTACT, source="Text2HOI (Cha et al. 2024), Sec. 3.1: the map",
     ),
     Metric(
         "contact_precision", touch.contact_precision, topic="Contact", title="precision of the contact map",
@@ -99,7 +99,7 @@ METRICS: tuple[Metric, ...] = (
         "contact_distance_mm", touch.contact_distance_mm, topic="Contact", unit="mm", direction="closer to recorded",
         title="distance to the object of joints that touch it in the recording", aligned=True,
         frames=f"{HANDS} and a joint touches in the true clip", frame_step=3, samples=2, thresholds=CONTACT,
-        source=f"{OWN}; Text2HOI Sec. 3.5 refines it",
+        source=f"{OWN}; Text2HOI Sec. 3.3 refines it",
     ),
     Metric(
         "penetration_mm", touch.penetration_mm, topic="Physics", title="penetration depth", unit="mm",

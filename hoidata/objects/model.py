@@ -55,6 +55,11 @@ class ObjectModel:
         corners = self.part[self.faces]
         return np.where((corners == corners[:, :1]).all(axis=1), corners[:, 0], SEAM).astype(np.uint8)
 
+    @cached_property
+    def scale_m(self) -> float:
+        """Distance of the farthest vertex from the mean of all vertices, the ``s_obj`` of Text2HOI, Sec. 3.1."""
+        return float(np.linalg.norm(self.vertices_m - self.vertices_m.mean(axis=0), axis=1).max())
+
     @property
     def parts(self) -> list[int]:
         """Indices of the parts that have faces; [0] for a rigid object."""

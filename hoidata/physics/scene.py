@@ -65,11 +65,6 @@ class Scene:
         """Height of the table top, estimated from the object if not given."""
         return float(np.percentile(self.lowest_m, TABLE_PERCENTILE)) if self.table_m is None else self.table_m
 
-    def lowest_of_m(self, hand: Capsules) -> float:
-        """Height of a hand's lowest capsule over all frames with the hand."""
-        ends_m = np.stack((hand.start_m, hand.end_m)) @ -self.gravity
-        return float(np.nanmin(ends_m - hand.radius_m))
-
     @property
     def lifted(self) -> np.ndarray:
         """(frame,) bool: the lowest vertex is more than 1.5 cm above the table, so only hands can support it."""

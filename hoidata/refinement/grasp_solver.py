@@ -1,8 +1,8 @@
 """Correct one hand relative to the object part it grasps: one constant correction per grasp, a smooth one around it.
 
 The unknowns are control points of a uniform cubic B-spline, 51 numbers each. All control points that influence a grasp
-are one. The frames of a grasp are nearly equal, so a few represent all; the cost grows with the frames outside of
-grasps. Solved by Levenberg-Marquardt.
+are one. A few frames of a grasp represent all; the cost grows with the frames outside of grasps. Solved by
+Levenberg-Marquardt.
 """
 
 from collections.abc import Sequence
@@ -20,6 +20,7 @@ from hoidata.refinement.skin import HandPose, SkinnedHand
 
 # How far skin moves, metres, per unit of each unknown: wrist position, hand rotation, finger joints.
 _LEVER_M = np.concatenate((np.ones(3), np.full(3, 0.1), np.full(45, 0.04)))
+GRASP_FRAMES = 6  # that represent a grasp
 _METRIC_VERTICES = 16  # the deviation of a pose from the original counts as that of 16 vertices
 
 
@@ -200,32 +201,6 @@ class GraspObjective:
         add_squares(frame, np.concatenate(slopes), derivative, weight, residual_m, matrix, vector)
 
 
-def solve_each_frame(objective: GraspObjective, steps: int) -> HandPose:
-    """The pose of each frame by itself, after ``steps`` of Levenberg-Marquardt with a damping per frame."""
-    state, damping = objective.start, np.full(len(objective.frames), 1e-3)
-    cost, diagonal = objective.costs(state), np.arange(N_UNKNOWNS)
-    for _ in range(steps):
-        matrix, vector = objective.equations(state)
-        matrix[:, diagonal, diagonal] *= 1 + damping[:, None]
-        trial = objective.evaluate(state.step + np.linalg.solve(matrix, vector[..., None])[..., 0])
-        trial_cost = objective.costs(trial)
-        is_better = trial_cost < cost
-        state = _select(is_better, trial, state)
-        cost, damping = np.where(is_better, trial_cost, cost), damping * np.where(is_better, 0.1, 10)
-    return state.pose
-
-
-def _select(chosen: np.ndarray, one: EvaluatedPose, other: EvaluatedPose) -> EvaluatedPose:
-    """In each frame ``one`` if ``chosen (frame,)``, else ``other``."""
-
-    def pick(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-
-    names = [name for name in EvaluatedPose._fields if name != "pose"]
-    arrays = {name: pick(getattr(one, name), getattr(other, name)) for name in names}
-    return EvaluatedPose(**arrays, pose=one.pose.where(chosen, other.pose))
-
-
 class HandMotion:
     """A hand's motion and its spline correction; everything in the frame of the part.
 
@@ -233,7 +208,7 @@ class HandMotion:
 
     Args:
         pose: (frame,) original pose.
-        grasps: frame intervals in which the hand does not move on the part.
+        grasps: frame intervals in which the correction is constant.
         valid: (frame,) bool, the hand is tracked.
     """
 
@@ -245,15 +220,14 @@ class HandMotion:
         grasps: Sequence[Interval],
         valid: np.ndarray,
         other: Capsules | None,
-        settings: SolverSettings,
-        attraction: Attraction,
+        settings: SolverSettings = SolverSettings(),
+        attraction: Attraction = Attraction(),
         part: int = 0,
         passed: np.ndarray | None = None,
     ) -> None:
         self.pose, self.settings = pose, settings
         self.all_weights = spline_weights(len(valid), grasps, settings.knot_frames)
-        per_grasp = 1 + 3 * (field.moves or other is not None)
-        frames, self.frame_weight, in_grasp = _representative_frames(grasps, valid, per_grasp, settings.every)
+        frames, self.frame_weight, in_grasp = _representative_frames(grasps, valid, settings.every)
         self.weights = self.all_weights[frames]
         bend = np.diff(np.eye(self.weights.shape[1]), n=2, axis=0)
         self.bend = bend.T @ bend / settings.bend_m**2  # of the control points' second differences
@@ -303,17 +277,17 @@ class HandMotion:
 
 
 def _representative_frames(
-    grasps: Sequence[Interval], valid: np.ndarray, per_grasp: int, frame_step: int
+    grasps: Sequence[Interval], valid: np.ndarray, frame_step: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frames to evaluate, how many frames each represents, and whether it is in a grasp.
 
-    per_grasp: frames that represent a grasp. frame_step: outside of grasps one of so many frames is evaluated.
+    frame_step: outside of grasps one of so many frames is evaluated.
     """
     weight, in_grasp = np.zeros(len(valid)), np.zeros(len(valid), bool)
     for start, stop in grasps:
         in_grasp[start:stop] = True
-        middles = ((np.arange(per_grasp) + 0.5) * (stop - start) / per_grasp).astype(int)
-        weight[start + middles] = (stop - start) / per_grasp
+        middles = ((np.arange(GRASP_FRAMES) + 0.5) * (stop - start) / GRASP_FRAMES).astype(int)
+        weight[start + middles] = (stop - start) / GRASP_FRAMES
     weight[np.flatnonzero(~in_grasp & valid)[frame_step // 2 :: frame_step]] = frame_step
     frames = np.flatnonzero(weight)
     return frames, weight[frames], in_grasp[frames]

@@ -28,23 +28,16 @@ class ObjectField:
         """Whether the object is articulated."""
         return len(self._parts) > 1
 
-    def most_depth_m(self, part: int) -> float:
-        """Largest depth inside of a part; 0 for a part without an inside."""
-        return max(0.0, -float(self._parts[part][0].value.min()))
-
     def nearest_part(self, points_m: np.ndarray) -> np.ndarray:
         """(frame, point) index of the part with the smallest distance to points (frame, point, 3), world."""
         return np.argmin([self.distances_to(part, points_m)[0] for part in range(len(self._parts))], axis=0)
 
-    def part_touched(
-        self, points_m: np.ndarray, touching: np.ndarray, part: int | None = None
-    ) -> tuple[int, np.ndarray]:
+    def part_touched(self, points_m: np.ndarray, touching: np.ndarray) -> tuple[int, np.ndarray]:
         """The part that most points touch, and which points touch it.
 
         Args:
             points_m: (frame, point, 3) world.
             touching: (frame, point) bool, whether a point touches the object.
-            part: count the points of this part instead of the most touched one.
 
         Returns:
             Index of the part, and (frame, point) bool, whether a point touches it.
@@ -53,8 +46,7 @@ class ObjectField:
             return 0, touching
         nearest = self.nearest_part(points_m)
         by_part = [touching & (nearest == number) for number in (0, 1)]
-        if part is None:
-            part = int(by_part[1].sum() > by_part[0].sum())
+        part = int(by_part[1].sum() > by_part[0].sum())
         return part, by_part[part]
 
     def distances(self, points_m: np.ndarray, frames: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

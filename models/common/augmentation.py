@@ -10,10 +10,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 from cachetools import LRUCache, cachedmethod
+from scipy.spatial.distance import cdist
 
 from hoidata.batches.dataset import ClipSample, HoiDataset, contact_of
 from hoidata.clips.features import OBJECT_HINGE, OBJECT_POSITION
 from hoidata.geometry.rotations import rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.hands.model import N_JOINTS
 from hoidata.store.distances import DistanceEntries
 from models.common.features import (
     base_middle_m,
@@ -89,6 +91,29 @@ def augment(sample: ClipSample, random: np.random.Generator, number: int) -> Cli
         contact=contact_of(distances, len(sample.points.points_m), sample.contact_threshold_m),
         distances=distances,
     )
+
+
+def scaled_contact(sample: ClipSample, factor: float, chosen: np.ndarray) -> np.ndarray:
+    """The contact map (2, K) bool of the sampled points ``chosen`` (K,) on the object scaled by ``factor``.
+
+    The hand keeps its size: every touching joint stays in metres as far above the same place of the surface. So its
+    reach covers more of a small object than of a large one.
+    """
+    points, normals, part = sample.points.points_m * factor, sample.points.normals, sample.points.part
+    side, point, gap_m = nearest_points(sample.distances)
+    joints_m = points[point] + gap_m[:, None] * normals[point]
+    distance_m = np.where(part[point, None] == part[chosen], cdist(joints_m, points[chosen]), np.inf)
+    touched = distance_m < sample.contact_threshold_m
+    return np.stack([touched[side == index].any(axis=0) for index in range(2)])
+
+
+def nearest_points(distances: DistanceEntries) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points that are nearest to a touching joint in a frame: side, point and the smallest distance in metres, (K,)."""
+    by_distance = distances.select(np.argsort(distances.distance_m, kind="stable"))
+    side, frame, joint = (getattr(by_distance, name).astype(np.int64) for name in ("side", "frame", "joint"))
+    nearest = by_distance.select(np.sort(np.unique((frame * 2 + side) * N_JOINTS + joint, return_index=True)[1]))
+    first = np.unique(nearest.point.astype(np.int64) * 2 + nearest.side, return_index=True)[1]
+    return nearest.side[first], nearest.point[first], nearest.distance_m[first]
 
 
 def warped_moments(length: int, random: np.random.Generator) -> np.ndarray:

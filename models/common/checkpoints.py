@@ -22,7 +22,7 @@ from hoidata.settings import build_config, plain_config
 from models.common.family import StoredNetwork
 from models.common.features import Normaliser
 
-FORMAT = 1
+FORMAT = 2
 FILE_NAME = "model.safetensors"
 _WEIGHTS, _NORMALISER = "weights.", "normaliser."
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hoidata.annotation.vocabulary import Vocabulary
 from hoidata.batches.dataset import ClipBatch, ClipSample, Crop, HoiDataset, collate
 from hoidata.batches.frame_selection import FrameSelection
 from hoidata.devices import send
@@ -18,7 +19,6 @@ from hoidata.files import canonical_json, sha256_bytes
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore
 from models.common.augmentation import Augmentation
-from models.common.vocabulary import Vocabulary
 
 BUCKET_BATCHES = 4
 Item = TypeVar("Item")

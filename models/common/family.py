@@ -100,6 +100,7 @@ class Sources:
     hands: HandPair  # the hand model of the dataset's clips
     device: torch.device
     settings: Mapping[str, Any] = field(default_factory=dict)  # section of params.yaml by family
+    encoder: str = ""  # name of the text encoder (``load_encoder``); "": the one that the annotation names
 
 
 @dataclass(frozen=True)
@@ -138,6 +139,7 @@ class Family:
     load: Callable[[Sources], Sampler]
     networks: tuple[Network, ...] = ()  # trained by this family
     uses: tuple[str, ...] = ()  # names of networks that sampling needs, of any family
+    estimates_length: bool = False  # motions do not have the length of the recorded clip
     # Metrics of its networks on the test clips: name of the network to metrics.
     diagnose: Callable[[Sources], Figures] = lambda sources: {}
 
@@ -183,7 +185,7 @@ def refuse_not_finite(request: Request, *values: Tensor | np.ndarray) -> None:
     """Raise BadInput with the request's name if a model's answer has a number that is not finite."""
     if not all(bool(torch.isfinite(torch.as_tensor(array)).all()) for array in values):
         sentence = f" ({request.sentence.words})" if request.sentence else ""
-        remedy = "lower the guidance (--scale), try another seed, or train the network again"
+        remedy = "try another seed, or train the network again"
         raise BadInput(f"motion {request.motion_id}{sentence}", "finite numbers", "NaN or infinity", remedy)
 
 

@@ -25,6 +25,7 @@ from hoidata.clips.features import (
     OBJECT_ROTATION_6D,
     WRIST,
 )
+from hoidata.devices import send
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d, rotvec_to_rotmat
 from hoidata.hands import HandKinematics, HandPair
 
@@ -38,6 +39,11 @@ SMALLEST_SCALE = 0.05
 def scaled_text(text: Tensor) -> Tensor:
     """Sentence features (..., D) scaled to length sqrt(D), independent of the encoder's scale."""
     return nn.functional.normalize(text, dim=-1) * text.shape[-1] ** 0.5
+
+
+def verb_one_hot(verbs: Sequence[str | None], known: Sequence[str], device: torch.device) -> Tensor:
+    """(B, len(known)) one-hot verbs; zeros for a verb that is not known."""
+    return send(torch.tensor([[float(verb == name) for name in known] for verb in verbs]), device)
 
 
 def hand_wrist_m(hands: Tensor) -> Tensor:
@@ -139,6 +145,26 @@ def place_points(batch: RequestBatch, objects: Tensor) -> Tensor:
     moves = ((batch.part == 1) & batch.articulated[:, None])[:, None, :, None]
     articulated = torch.where(moves, moved, still)
     return articulated @ object_rotmat(objects).transpose(-1, -2) + object_position_m(objects)[..., None, :]
+
+
+def turned_since_start(objects: Tensor) -> Tensor:
+    """Object features (F, 16): rotations become relative to the first frame, whose rotation (6 numbers) is appended."""
+    rotation = object_rotmat(objects)
+    since_start_6d, start_6d = rotmat_to_rot6d(rotation @ rotation[0].T), rotmat_to_rot6d(rotation[:1])
+    start_6d = start_6d.expand(len(objects), -1)
+    return torch.cat((objects[:, OBJECT_POSITION], since_start_6d, objects[:, OBJECT_HINGE:], start_6d), -1)
+
+
+def mean_start(rows: Tensor, mask: Tensor) -> Tensor:
+    """First-frame rotations (B, 1, 3, 3): the mean over control points (B, L, 16) that ``mask`` (B, L) marks valid."""
+    start_6d = (rows[..., OBJECT_START_6D] * mask[..., None]).sum(1, keepdim=True)
+    return rot6d_to_rotmat(start_6d / mask.sum(1)[:, None, None])
+
+
+def turned_from(rows: Tensor, start: Tensor) -> Tensor:
+    """Object features (B, F, 10): the inverse of ``turned_since_start``, for first-frame rotations (B, 1, 3, 3)."""
+    rotation = rotmat_to_rot6d(object_rotmat(rows) @ start)
+    return torch.cat((rows[..., OBJECT_POSITION], rotation, rows[..., OBJECT_HINGE:OBJECT_FEATURES]), -1)
 
 
 class Hands(nn.Module):

@@ -9,6 +9,21 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from hoidata.clips.features import (
+    GLOBAL_ORIENT_6D,
+    HAND_FEATURES,
+    HAND_POSE_6D,
+    OBJECT_FEATURES,
+    OBJECT_HINGE,
+    OBJECT_POSITION,
+    OBJECT_ROTATION_6D,
+    WRIST,
+)
+from models.common.features import OBJECT_START_6D
+
+HAND_GROUPS = (WRIST, GLOBAL_ORIENT_6D, HAND_POSE_6D)
+OBJECT_GROUPS = (OBJECT_POSITION, OBJECT_ROTATION_6D, slice(OBJECT_HINGE, OBJECT_HINGE + 1), OBJECT_START_6D)
+
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Mean of ``values`` where ``mask`` (broadcast to them) is set."""
@@ -92,3 +107,20 @@ def take_frames(x: Tensor, chosen: Tensor, axis: int) -> Tensor:
     """The frames ``chosen`` (B, K) of ``x``; ``axis``, 1 or 2, is the frame axis."""
     clip = torch.arange(len(x), device=x.device)[:, None]
     return x[clip, chosen] if axis == 1 else x.transpose(1, 2)[clip, chosen].transpose(1, 2)
+
+
+def feature_weights(
+    by_group: bool, device: torch.device, object_features: int = OBJECT_FEATURES
+) -> tuple[Tensor, Tensor]:
+    """Loss weights of a hand's 99 and an object's 10 or 16 features, for squared errors of a control point.
+
+    by_group: a mean with equal weight of wrist, palm and fingers, and of the object's position, rotation and hinge;
+        else a sum (Text2HOI).
+    """
+    weights, object_groups = [], [group for group in OBJECT_GROUPS if group.stop <= object_features]
+    for size, groups in ((HAND_FEATURES, HAND_GROUPS), (object_features, object_groups)):
+        weight = torch.ones(size, device=device)
+        for group in groups if by_group else ():
+            weight[group] = 1 / (len(groups) * (group.stop - group.start))
+        weights.append(weight)
+    return weights[0], weights[1]

@@ -18,6 +18,13 @@ class PointNetConfig:
     heads: tuple[int, int] = (512, 256)
     # Predict a matrix per cloud that aligns its points.
     align: bool = True
+    # Points relative to their mean, in units of the farthest one's distance. The paper divides points by the object's
+    # scale and does not move them.
+    centred: bool = False
+
+    def normalised(self, points_m: Tensor, scale_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Points (B, N, 3) without unit, and their unit (B, 1) in metres; ``scale_m`` (B,) is the object's scale."""
+        return normalised_points(points_m) if self.centred else (points_m / scale_m[:, None, None], scale_m[:, None])
 
 
 def normalised_points(points_m: Tensor) -> tuple[Tensor, Tensor]:
@@ -25,6 +32,32 @@ def normalised_points(points_m: Tensor) -> tuple[Tensor, Tensor]:
     centred = points_m - points_m.mean(1, keepdim=True)
     scale = centred.norm(dim=-1).amax(1)
     return centred / scale[:, None, None], scale[:, None]
+
+
+def spread_out(points_m: Tensor, kinds: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Farthest-point sampling (Eldar et al. 1997) among the points of each kind.
+
+    The first point is the one farthest from the centre of its kind.
+
+    Args:
+        points_m: (B, N, 3).
+        kinds: (B, S, N) bool.
+
+    Returns:
+        Indices (B, S, count), and the mask (B, S, count) of those that exist.
+    """
+    weight = kinds.to(points_m.dtype)
+    centre = weight @ points_m / weight.sum(-1, keepdim=True).clamp_min(1)
+    from_centre = torch.cdist(centre, points_m).masked_fill(~kinds, -1.0)
+    farthest = from_centre.argmax(-1)
+    nearest, chosen, mask = from_centre.clone().masked_fill(kinds, torch.inf), [], []
+    for _ in range(count):
+        mask.append(nearest.gather(-1, farthest[..., None])[..., 0] > 0)
+        chosen.append(farthest)
+        picked = points_m.gather(1, farthest[..., None].expand(-1, -1, 3))
+        nearest = torch.minimum(nearest, torch.cdist(picked, points_m)).masked_fill(~kinds, -1)
+        farthest = nearest.argmax(-1)
+    return torch.stack(chosen, -1), torch.stack(mask, -1)
 
 
 class PointNet(nn.Module):

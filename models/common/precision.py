@@ -9,11 +9,9 @@ from models.common.point_net import PointNet
 from models.common.transformer import Encoder
 
 Precision = Literal["float32", "bfloat16"]
-# float16 has eight times the precision of bfloat16, but gradients would need scaling: it is for sampling only.
-SamplingPrecision = Literal["float32", "bfloat16", "float16"]
 
 
-def compute_in(network: nn.Module, precision: SamplingPrecision) -> None:
+def compute_in(network: nn.Module, precision: Precision) -> None:
     """Make these parts of ``network`` compute in ``precision`` (autocast). Weights and outputs stay float32."""
     if precision == "float32":
         return

@@ -67,6 +67,7 @@ def sample_family(
     hands: HandPair,
     *,
     settings: Mapping[str, Any] | None = None,
+    encoder: str = "",
     device: str = "cpu",
 ) -> dict[str, int]:
     """Sample a family's motions for the test clips.
@@ -74,13 +75,15 @@ def sample_family(
     Writes ``out/clips`` and ``out/diagnostics.json``, or ``out/empty.json`` with the reason. Skipped requests are
     listed in ``out/left_out.json``. A family that is :class:`ReportsContact` also gets ``out/asked.npz`` or
     ``out/asked-distances.npz`` (``hoidata.metrics.target_contact``). Motion k for a clip is named ``<clip id>~<k>``.
-    Length and hand type are those of the recorded clip; of a clip that is too long, the first frames count.
+    Length and hand type are those of the recorded clip, unless the family estimates them; of a clip that is too long,
+    the first frames count.
 
     Args:
         annotated_root: folder with clips, annotation, contact and splits of a dataset.
         checkpoints: folder with one checkpoint folder per network.
         params: a :class:`PredictionConfig`.
         settings: section of params.yaml by family.
+        encoder: name of the text encoder, for families that read sentences; "": the one that the annotation names.
 
     Returns:
         Counts of the store.
@@ -95,9 +98,10 @@ def sample_family(
         with atomic_folder(out) as partial:
             write_empty(partial, reason or "no test clips")
         return {"clips": 0}
-    sources = Sources(annotated, checkpoints, hands, device=torch.device(device), settings=settings or {})
+    sources = Sources(annotated, checkpoints, hands, torch.device(device), settings or {}, encoder)
     with atomic_folder(out) as partial:
         info = annotated.info | {"family": family.name, "sampling_device": sources.device.type}
+        info |= {"length": "own"} if family.estimates_length else {}
         left_out, contacts = list[Skipped](), dict[str, np.ndarray | TargetDistances]()
         motions = _motions_of(_motions(family.load(sources), test, config, contacts), left_out)
         first = next(motions, None)

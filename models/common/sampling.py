@@ -32,12 +32,10 @@ class SamplerConfig:
 
     kind: Kind = "ddim"  # "ddim" and "dpm++" are deterministic given the initial noise, "ddpm" is not
     steps: int = 20  # denoiser calls, 1 to 1,000
-    guidance: float = 1.0  # scale of classifier-free guidance; 1: none
 
     def __post_init__(self) -> None:
-        if not (1 <= self.steps <= TRAIN_STEPS and math.isfinite(self.guidance)):
-            expected, got = f"1 to {TRAIN_STEPS} steps, a finite guidance", f"{self.steps}, {self.guidance:g}"
-            raise BadInput("sampler", expected, got, "correct steps, or guidance (--scale)")
+        if not 1 <= self.steps <= TRAIN_STEPS:
+            raise BadInput("sampler", f"1 to {TRAIN_STEPS} steps", str(self.steps), "correct steps")
 
 
 @cache
@@ -66,12 +64,6 @@ def add_noise(clean: Tensor, noise: Tensor, steps: Tensor, alphas_bar: Tensor) -
     """Noise a clean motion to ``steps`` (B,) (Text2HOI, Eq. 1). ``alphas_bar`` (1000,) is :func:`alphas_cumprod`."""
     alpha_bar = alphas_bar[steps].reshape(-1, *[1] * (clean.ndim - 1))
     return alpha_bar.sqrt() * clean + (1 - alpha_bar).sqrt() * noise
-
-
-def draw_motion(hands_shape: tuple[int, ...], object_shape: tuple[int, ...], generator: torch.Generator) -> Motion:
-    """Noise of the given shapes (B, ...) from one generator, one motion after the other."""
-    sizes = [math.prod(shape[1:]) for shape in (hands_shape, object_shape)]
-    return _unflatten(torch.randn(hands_shape[0], sum(sizes), generator=generator), hands_shape, object_shape)
 
 
 def draw_each(

@@ -2,7 +2,7 @@
 
 Between two knots a curve is a cubic polynomial, twice continuously differentiable across knots (de Boor 1978); the
 curve of n frames with m intervals has m + 3 control points. Control points sum to one at every frame, so they have
-the unit and the mean of the values that they describe.
+the unit and the mean of the values that they describe. ``whiten`` decorrelates those of an object's trajectory.
 """
 
 from functools import lru_cache
@@ -10,12 +10,16 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from hoidata.clips.features import OBJECT_FEATURES
 from hoidata.devices import send
 
 # Weight of the second differences: determines control points that few frames constrain, or none.
 STIFFNESS = 1e-6
-# Weight of differences between neighbours at rest, relative to the distance of each from its original position.
-REST = 100.0
+# Features of an object that has not moved: position, 6D of the identity, hinge.
+UNMOVED = torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+# Smoothness prior: fraction of the variance that is independent per control point, and the standard deviation. The
+# deviation keeps trajectories of a few centimetres above the normaliser's SMALLEST_SCALE.
+ROUGH, DEVIATION = 0.3, 0.5
 
 
 def intervals_of(n_frames: int, knot_frames: int) -> int:
@@ -61,39 +65,6 @@ def stacked_bases(lengths: list[int], intervals: list[int], n_frames: int, devic
     return send(bases, device)
 
 
-def snapped_to_rest(points: Tensor, mask: Tensor, reach: Tensor | float, around: int) -> Tensor:
-    """Control points (..., K, D) with those at rest pulled together; moving ones keep their values.
-
-    Weighted least squares with Tukey's biweight. The weights are not re-estimated from the result, which would create
-    steps.
-
-    Args:
-        mask: (..., K) bool, valid control points.
-        reach: (D,) or one number. Two sides of a gap that differ by twice this surely move.
-        around: control points compared on each side of a gap. The two at the gap are not enough: a slow trajectory
-            would become steps, and the turning point of a shake would count as rest.
-    """
-    index = torch.arange(points.shape[-2], device=points.device)
-    offset = index - index[:-1, None] - 0.5  # of each control point from each gap
-    sides = (offset < 0) & (offset > -around), (offset > 0) & (offset < around)
-    before, after = (_mean_weights(side.to(points) * mask[..., None, :]) for side in sides)
-    both = (before + after) / 2
-    identity = torch.eye(len(index), device=points.device)
-    # Centred, because squares of large numbers lose the digits in which they differ.
-    centred = points - _mean_weights(mask.to(points)[..., None, :]) @ points
-    moved = (after @ centred - before @ centred).square()
-    spread = (both @ centred.square() - (both @ centred).square()).clamp_min(0)
-    apart = ((moved + spread) / (2 * reach) ** 2).sum(-1)
-    weight = REST * (mask[..., 1:] & mask[..., :-1]) * (1 - apart).clamp_min(0).square()
-    diff = identity.diff(dim=0)
-    return torch.linalg.solve(identity + diff.T @ (weight[..., None] * diff), points)
-
-
-def _mean_weights(selection: Tensor) -> Tensor:
-    """Rows (..., K) of zeros and ones, scaled so that a product with them gives the mean of the selected points."""
-    return selection / selection.sum(-1, keepdim=True).clamp_min(1)
-
-
 def projected(x: Tensor, lengths: list[int], knot_frames: int) -> Tensor:
     """(B, ..., F, D) replaced by the nearest splines with a knot every ``knot_frames``; padding becomes zero."""
     counts = [intervals_of(length, knot_frames) for length in lengths]
@@ -108,3 +79,38 @@ def _projection(n_frames: int, intervals: int) -> Tensor:
     return spline_basis(n_frames, intervals) @ fit_spline(
         torch.eye(n_frames, dtype=torch.float64), torch.ones(n_frames), intervals
     )
+
+
+def whiten(rows: Tensor, reach: float) -> Tensor:
+    """Control points (..., L, 10 or 16) decorrelated by the smoothness prior; first-frame rotations are unchanged.
+
+    Args:
+        reach: correlation length of the prior, in control points.
+    """
+    moved = rows[..., :OBJECT_FEATURES] - _as(UNMOVED, rows)
+    # Multiplication by the inverse of the Cholesky factor decorrelates the control points.
+    whitened = torch.linalg.solve_triangular(_as(smooth_root(rows.shape[-2], reach), rows), moved, upper=False)
+    return torch.cat((whitened, rows[..., OBJECT_FEATURES:]), -1)
+
+
+def unwhiten(rows: Tensor, reach: float) -> Tensor:
+    """The inverse of :func:`whiten`."""
+    moved = _as(smooth_root(rows.shape[-2], reach), rows) @ rows[..., :OBJECT_FEATURES]
+    return torch.cat((moved + _as(UNMOVED, rows), rows[..., OBJECT_FEATURES:]), -1)
+
+
+def _as(constant: Tensor, rows: Tensor) -> Tensor:
+    """``constant`` with the device and dtype of ``rows``."""
+    return send(constant, rows.device).to(rows.dtype)
+
+
+@lru_cache(maxsize=256)
+def smooth_root(rows: int, reach: float) -> Tensor:
+    """Cholesky factor (rows, rows), lower triangular, of the smoothness prior's covariance.
+
+    The factor of fewer rows is its upper left block, so padding in a batch does not change a motion.
+    """
+    position = torch.arange(rows, dtype=torch.float64)
+    correlation = torch.exp(-0.5 * ((position[:, None] - position) / reach).square())
+    covariance = (1 - ROUGH) * correlation + ROUGH * torch.eye(rows, dtype=torch.float64)
+    return DEVIATION * torch.linalg.cholesky(covariance).float()

@@ -20,15 +20,16 @@ from torch.nn import functional
 from hoidata.batches.requests import RequestBatch
 from hoidata.devices import send
 from models.common.features import TEXT_FEATURES, scaled_text
-from models.common.point_net import PointLayer, PointNet, PointNetConfig, normalised_points
+from models.common.point_net import PointLayer, PointNet, PointNetConfig
 
-HAND_FLAGS = 2
+TYPICAL_SCALE_M, LOG_SCALE_DEVIATION = 0.08, 0.5  # of hand-held objects
 TOUCH_WEIGHT = 0.1  # of the anchors' cross-entropy relative to that of the maps
 N_SIDES = 2
 ANCHORS = 4  # per hand
 ANCHOR_FEATURES = 8
 WAVES = (1.0, 2.0, 4.0)  # frequencies of sine and cosine position features
-REACHES = (0.1, 0.2, 0.4)  # widths of Gaussians about the anchors, relative to the object's radius
+# Widths of Gaussians about the anchors: a hand's reach does not scale with the object.
+REACHES_M = (0.008, 0.016, 0.032)
 FAR = 10.0  # distance of a point from an anchor that is not given
 ANCHOR_STRIDE = 4  # every fourth of the sampled points may become an anchor
 
@@ -39,6 +40,7 @@ class EncodedPoints(NamedTuple):
     points: Tensor  # (B, N, 3) normalised
     local: Tensor  # (B, N, L) per-point features
     clip: Tensor  # (B, width) features of object, sentence and hand flags
+    unit_m: Tensor  # (B, 1) metres per unit of ``points``
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,9 @@ class ContactLossConfig:
     """The loss's sizes."""
 
     points: int = 1024  # sampled from every object in each training step
+    # Half of the clips of a step have an object scaled by a random factor, at most this one or its inverse, and its
+    # contact map (``scaled_contact``); 1: none.
+    max_scaling: float = 1.0
 
 
 class ContactModel(nn.Module):
@@ -94,26 +99,26 @@ class ContactModel(nn.Module):
         mean, log_variance = self.to_latent(overall).chunk(2, -1)
         return mean, log_variance.clamp(-8, 4)
 
-    def decode(self, points_m: Tensor, text: Tensor, latent: Tensor) -> Tensor:
-        """Logits (B, N) from points (B, N, 3), sentence (B, text) and z (B, latent)."""
-        points, scale = normalised_points(points_m)
+    def decode(self, points_m: Tensor, scale_m: Tensor, text: Tensor, latent: Tensor) -> Tensor:
+        """Logits (B, N) from points (B, N, 3), the object's scale (B,), sentence (B, text) and z (B, latent)."""
+        points, scale = self.config.point_net.normalised(points_m, scale_m)
         overall, local = self.object_net(points)
         clip = torch.cat((overall, scale, text, latent), -1)
         return self.rest(self.from_point(local) + self.from_clip(clip)[:, None])[..., 0]
 
     def forward(
-        self, points_m: Tensor, text: Tensor, contact_map: Tensor, noise: Tensor
+        self, points_m: Tensor, scale_m: Tensor, text: Tensor, contact_map: Tensor, noise: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Training pass: logits (B, N), mean and log-variance of z; noise (B, latent) for the reparameterisation."""
-        mean, log_variance = self.encode(normalised_points(points_m)[0], contact_map)
+        mean, log_variance = self.encode(self.config.point_net.normalised(points_m, scale_m)[0], contact_map)
         # Reparameterisation (Kingma and Welling 2014): the gradient passes through mean and variance.
         latent = mean + (0.5 * log_variance).exp() * noise
-        return self.decode(points_m, text, latent), mean, log_variance
+        return self.decode(points_m, scale_m, text, latent), mean, log_variance
 
     @torch.no_grad()
     def sample(self, batch: RequestBatch, text: Tensor, latents: Tensor) -> Tensor:
         """Contact probabilities (B, count, 2, N), equal for active hands; latents (count, B, latent) from N(0, I)."""
-        maps = torch.stack([self.decode(batch.points_m, text, z).sigmoid() for z in latents], 1)
+        maps = torch.stack([self.decode(batch.points_m, batch.scale_m, text, z).sigmoid() for z in latents], 1)
         return maps[:, :, None] * batch.active_hands[:, None, :, None]
 
     def draw_latents(self, count: int, n_clips: int, generator: torch.Generator) -> Tensor:
@@ -142,7 +147,7 @@ class AnchoredContact(nn.Module):
         first, second, third = config.decoder_widths
         self.from_point = nn.Linear(local + 3 + 6 * len(WAVES) + N_SIDES * ANCHOR_FEATURES, first)
         self.from_clip = nn.Sequential(
-            nn.Linear(overall + 1 + TEXT_FEATURES + HAND_FLAGS, first), nn.GELU(), nn.Linear(first, first)
+            nn.Linear(overall + 1 + TEXT_FEATURES + N_SIDES, first), nn.GELU(), nn.Linear(first, first)
         )
         self.rest = nn.Sequential(
             nn.GELU(),
@@ -153,12 +158,14 @@ class AnchoredContact(nn.Module):
             nn.Linear(third, 2 * N_SIDES),
         )
 
-    def encode_points(self, points_m: Tensor, text: Tensor, active_hands: Tensor) -> EncodedPoints:
-        """Encode an object with points (B, N, 3), a sentence (B, 512) and hand flags (B, 2); anchors come later."""
-        points, scale = normalised_points(points_m)
+    def encode_points(self, points_m: Tensor, scale_m: Tensor, text: Tensor, active_hands: Tensor) -> EncodedPoints:
+        """Encode an object with points (B, N, 3) and scale (B,), a sentence (B, 512) and hand flags (B, 2)."""
+        points, scale = self.config.point_net.normalised(points_m, scale_m)
         overall, local = self.object_net(points)
-        clip = torch.cat((overall, scale, scaled_text(text), active_hands.float()), -1)
-        return EncodedPoints(points, local, self.from_clip(clip))
+        # Metres are too small to learn from; the logarithm is standardised.
+        log_scale = (scale / TYPICAL_SCALE_M).log() / LOG_SCALE_DEVIATION
+        clip = torch.cat((overall, log_scale, scaled_text(text), active_hands.float()), -1)
+        return EncodedPoints(points, local, self.from_clip(clip), scale)
 
     def logits(self, cloud: EncodedPoints, anchors: Tensor, anchor_mask: Tensor) -> tuple[Tensor, Tensor]:
         """Logits of the next anchor and of the contact maps, (B, 2, N) each, by hand.
@@ -167,12 +174,13 @@ class AnchoredContact(nn.Module):
             anchors: (B, 2, A, 3) normalised points.
             anchor_mask: (B, 2, A) bool, the anchors given so far.
         """
-        points, local, clip = cloud
+        points, local, clip, unit_m = cloud
         distance = torch.cdist(points[:, None], anchors).masked_fill(~anchor_mask[:, :, None], FAR)
         nearest_distance, nearest_anchor = distance.min(-1)
         offset = points[:, None] - anchors.gather(2, nearest_anchor[..., None].expand(-1, -1, -1, 3))
-        # Gaussians of the distance to each anchor, at three scales.
-        bells = [torch.exp(-0.5 * (distance / reach).square()).sum(-1) for reach in REACHES]
+        # Gaussians of the distance to each anchor, at three widths.
+        distance_m = distance * unit_m[:, None, None]
+        bells = [torch.exp(-0.5 * (distance_m / reach_m).square()).sum(-1) for reach_m in REACHES_M]
         anchor_fraction = anchor_mask.to(points.dtype).mean(-1)[..., None].expand_as(nearest_distance)
         anchor_features = torch.cat((offset, torch.stack((nearest_distance, anchor_fraction, *bells), -1)), -1)
         anchor_features = anchor_features * anchor_mask.any(-1)[..., None, None]
@@ -184,7 +192,7 @@ class AnchoredContact(nn.Module):
         return touch, contact
 
     def losses(
-        self, points_m: Tensor, text: Tensor, batch: RequestBatch, contact: Tensor, generator: torch.Generator
+        self, batch: RequestBatch, text: Tensor, contact: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
         """Cross-entropy of one hand's next anchor, and logits (B, 2, N) of the maps given all anchors.
 
@@ -194,7 +202,8 @@ class AnchoredContact(nn.Module):
         Args:
             contact: (B, 2, N) float, recorded maps.
         """
-        cloud, count, device = self.encode_points(points_m, text, batch.active_hands), ANCHORS, contact.device
+        cloud = self.encode_points(batch.points_m, batch.scale_m, text, batch.active_hands)
+        count, device = ANCHORS, contact.device
         has_contact = contact.any(-1) & batch.active_hands
         uniform = send(torch.rand(len(contact), N_SIDES, count, generator=generator), device)
         index = sample_indices(contact, uniform)[..., None].expand(-1, -1, -1, 3)
@@ -223,9 +232,9 @@ class AnchoredContact(nn.Module):
             latents: (count, B, 2, A) uniform random numbers from 0 to 1.
         """
         points_m, active_hands = batch.points_m, batch.active_hands
-        cloud, maps = self.encode_points(points_m, text, active_hands), []
+        cloud, maps = self.encode_points(points_m, batch.scale_m, text, active_hands), []
         sides = [side for side in range(N_SIDES) if batch.sides[side]]
-        candidates = EncodedPoints(cloud.points[:, ::ANCHOR_STRIDE], cloud.local[:, ::ANCHOR_STRIDE], cloud.clip)
+        candidates = EncodedPoints(cloud.points[:, ::ANCHOR_STRIDE], cloud.local[:, ::ANCHOR_STRIDE], *cloud[2:])
         clips = torch.arange(len(points_m), device=points_m.device)
         no_mask = latents.new_zeros(latents.shape[1:], dtype=torch.bool)
         no_anchors = points_m.new_zeros(*no_mask.shape, 3)

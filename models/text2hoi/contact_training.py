@@ -1,6 +1,7 @@
 """Training of the contact network, and its results on validation clips: probability thresholds of contact."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +12,7 @@ from hoidata.batches.dataset import ClipBatch, ClipSample, collate
 from hoidata.batches.requests import RequestBatch
 from hoidata.contact.maps import f1_score
 from hoidata.devices import send
+from models.common.augmentation import scaled_contact
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
 from models.common.family import Losses, Network, Objective, Setup
@@ -78,8 +80,9 @@ def _batch_and_latents(
     return collate(samples).to(device), send(latents, device)
 
 
-# From a batch, sentence features (B, 512) and random numbers to contact maps (B, 2, N) by hand.
-SampleContact = Callable[[RequestBatch, Tensor, torch.Generator], Tensor]
+# From a batch, sentence features (B, 512) and random numbers, of the batch or of each motion, to contact maps (B, 2, N)
+# by hand, from 0 to 1.
+SampleContact = Callable[[RequestBatch, Tensor, torch.Generator | Sequence[torch.Generator]], Tensor]
 
 
 class ContactObjective:
@@ -95,17 +98,34 @@ class ContactObjective:
         return collate(self.corpus.held_out).to(self.device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
-        chosen = send(torch.randperm(batch.points_m.shape[1], generator=generator)[: self.loss.points], self.device)
-        points, text, network = batch.points_m[:, chosen], any_form(batch, generator), self.network
+        order = torch.randperm(batch.points_m.shape[1], generator=generator)[: self.loss.points]
+        chosen, text, network = send(order, self.device), any_form(batch, generator), self.network
+        contact = batch.contact[..., chosen].float()
+        batch = replace(batch, points_m=batch.points_m[:, chosen])
+        if self.loss.max_scaling > 1:
+            batch, contact = self._scaled(batch, contact, order.numpy(), generator)
         if isinstance(network, AnchoredContact):
-            contact = batch.contact[..., chosen].float()
-            touch, logits = network.losses(points, text, batch, contact, generator)
+            touch, logits = network.losses(batch, text, contact, generator)
             return by_hand_loss(touch, logits, contact, batch.active_hands)
         assert isinstance(network, ContactModel)
-        contact_map = batch.contact_map[:, chosen]
+        contact_map = contact.amax(1)
         noise = send(torch.randn(len(batch), network.config.latent, generator=generator), self.device)
-        logits, mean, log_variance = network(points, text, contact_map, noise)
+        logits, mean, log_variance = network(batch.points_m, batch.scale_m, text, contact_map, noise)
         return contact_loss(logits, contact_map, mean, log_variance)
+
+    def _scaled(
+        self, batch: ClipBatch, contact: Tensor, chosen: np.ndarray, generator: torch.Generator
+    ) -> tuple[ClipBatch, Tensor]:
+        """Scale the objects of about half of the clips by log-uniform factors, and recompute their maps (B, 2, K)."""
+        is_scaled, exponent = torch.rand(2, len(batch), generator=generator)
+        factor = self.loss.max_scaling ** ((2 * exponent - 1) * (is_scaled < 0.5))
+        maps = [
+            contact_map if size == 1 else torch.from_numpy(scaled_contact(sample, size, chosen)).to(contact)
+            for sample, size, contact_map in zip(batch.samples, factor.tolist(), contact, strict=True)
+        ]
+        factor = send(factor, self.device)
+        scaled = replace(batch, points_m=batch.points_m * factor[:, None, None], scale_m=batch.scale_m * factor)
+        return scaled, torch.stack(maps)
 
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
@@ -135,25 +155,16 @@ def sample_threshold(checkpoint: Checkpoint) -> float:
     return float(results.get("draw_threshold", results["contact_threshold"]))
 
 
-def touched_maps(checkpoint: Checkpoint, batch: RequestBatch, text: Tensor, latents: Tensor) -> Tensor:
-    """Sampled contact maps (B, K, 2, N), 0 or 1, by hand; the most probable points if none reaches the threshold.
-
-    Args:
-        text: (B, 512) sentence features.
-        latents: (K, B, ...) from the network's ``draw_latents``.
-    """
-    network = checkpoint.network
-    assert isinstance(network, ContactNetwork)
-    probability = network.sample(batch, text, send(latents, text.device))
-    # If no point reaches the threshold, the limit is the highest probability.
-    limit = probability.amax(-1, keepdim=True).clamp_max(sample_threshold(checkpoint))
-    return ((probability >= limit) & batch.active_hands[:, None, :, None]).float()
+def touched(checkpoint: Checkpoint, probability: Tensor) -> Tensor:
+    """(..., N) bool: points that count as touched; the most probable ones if none reaches the threshold."""
+    return probability >= probability.amax(-1, keepdim=True).clamp_max(sample_threshold(checkpoint))
 
 
 def most_typical(maps: Tensor) -> Tensor:
-    """The medoid of each motion's maps (B, K, 2, N), 0 or 1: the one with the best mean F1 with the others, (B, 2, N).
+    """The medoid (B, 2, N) of each motion's maps (B, K, 2, N): the one with the best mean F1 with the others.
 
-    F1 counts points touched by either hand. The first of equals. This is minimum Bayes risk decoding.
+    Maps are from 0 to 1. F1 counts points touched by either hand. The first of equals.
+    This is minimum Bayes risk decoding.
     """
     either = maps.amax(2)
     # F1 of all pairs of maps: 2 |A and B| / (|A| + |B|).
@@ -163,13 +174,26 @@ def most_typical(maps: Tensor) -> Tensor:
     return maps[torch.arange(len(maps), device=maps.device), best]
 
 
-def contact_sampler(checkpoint: Checkpoint) -> SampleContact:
-    """Samples one map per motion from a trained contact network, as in the paper."""
+def contact_sampler(checkpoint: Checkpoint, is_binary: bool, count: int = 1) -> SampleContact:
+    """Samples maps from a trained contact network: probabilities, as in the paper, or 0 or 1.
+
+    count: maps sampled per motion, of which the medoid counts. Maps of the VAE hardly differ, so one is sampled.
+    """
     network = checkpoint.network
     assert isinstance(network, ContactNetwork)
-    return lambda batch, text, generator: touched_maps(
-        checkpoint, batch, text, network.draw_latents(1, len(batch), generator)
-    )[:, 0]
+    count = count if isinstance(network, AnchoredContact) else 1
+
+    def sample(batch: RequestBatch, text: Tensor, random: torch.Generator | Sequence[torch.Generator]) -> Tensor:
+        if isinstance(random, torch.Generator):
+            latents = network.draw_latents(count, len(batch), random)
+        else:
+            latents = torch.cat([network.draw_latents(count, 1, generator) for generator in random], 1)
+        maps = network.sample(batch, text, send(latents, text.device))
+        if is_binary:
+            maps = (touched(checkpoint, maps) & batch.active_hands[:, None, :, None]).float()
+        return most_typical(maps)
+
+    return sample
 
 
 def _objective(setup: Setup) -> tuple[Objective, None]:

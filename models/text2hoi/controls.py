@@ -2,14 +2,12 @@
 
 A negative control is Text2HOI with one input replaced: a metric that does not change does not depend on that input.
 
-A retrieval baseline has no network: it retrieves a training clip of the same prompt or verb, and post-processes it like
-Text2HOI's samples. It applies contact refinement, then rejection sampling: if the hands cannot carry the object or the
-motion is unusual for its verb, the next clip of the ranking is a candidate. So selection gives networks no advantage.
+A retrieval baseline has no network: it retrieves a training clip of the same prompt or verb. With contact refinement it
+is the baseline of ``text2hoi-contact``.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,13 +18,11 @@ from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.hands import HandPair
-from hoidata.refinement import carried_fraction, refine_grasps
-from hoidata.settings import build_config
+from hoidata.refinement import refine_grasps
 from models.baselines.retrieval import PROMPT_LOOKUP, VERB_LOOKUP
 from models.common.family import Family, Sampler, Skipped, Sources
 from models.text2hoi.family import NAMES, OtherPrompt, load_text2hoi, other_prompts
-from models.text2hoi.sampler import Candidate, SamplingConfig, Text2Hoi, best_candidates, verb_check_results
-from models.text2hoi.verb_check import VerbCheck, usual_motion
+from models.text2hoi.sampler import Text2Hoi
 
 
 @dataclass(frozen=True)
@@ -84,16 +80,13 @@ def _shared(one: ClipSample, other: ClipSample) -> float:
     return float((one.contact_map & other.contact_map).sum() / either) if either else 1.0
 
 
-def _one_call(sources: Sources) -> Sampler:
-    model = load_text2hoi(sources)
-    return replace(model, config=replace(model.config, sampler=replace(model.config.sampler, steps=1)))
-
-
 def _family(name: str, title: str, load: Any) -> Family:
     return Family(name, title, load, uses=NAMES)
 
 
-ONE_CALL = _family("one-call", "Text2HOI, one call of the denoiser", _one_call)
+ONE_CALL = _family(
+    "one-call", "Text2HOI, one call of the denoiser", lambda sources: load_text2hoi(sources).with_sampler(steps=1)
+)
 OTHER_CONTACT = _family(
     "other-contact",
     "Text2HOI, another clip's contact map",
@@ -108,44 +101,21 @@ OTHER_PROMPT_OWN_CONTACT = _family(
 
 @dataclass(frozen=True)
 class RefinedRetrieval:
-    """A retrieval baseline with contact refinement and rejection sampling."""
+    """A retrieval baseline with contact refinement."""
 
-    lookup: Sampler  # retrieves training clips
+    retrieval: Sampler
     pair: HandPair
-    config: SamplingConfig  # as of Text2HOI
-    check: VerbCheck  # of the training clips
-
-    @classmethod
-    def load(cls, lookup: Family, sources: Sources) -> "RefinedRetrieval":
-        config = build_config(SamplingConfig, sources.settings.get("text2hoi"), "params.yaml: sample.text2hoi")
-        store = sources.annotated
-        check = VerbCheck.read(usual_motion(store), store.contact_threshold_m, sources.hands)
-        return cls(lookup.load(sources), sources.hands, config, check)
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
-        found = list(self.lookup.sample(requests))
-        there = [row for row, one in enumerate(found) if isinstance(one, Clip)]
-
-        def draw(numbers: Sequence[int], which: int) -> list[Candidate]:
-            own = [requests[there[number]] for number in numbers]
-            again = [replace(one, number=one.number + which - 1) for one in own]
-            clips = [found[there[number]] for number in numbers] if which == 1 else self.lookup.sample(again)
-            return [self._held(one, clip) for one, clip in zip(own, clips, strict=True)]
-
-        for row, drawn in zip(there, best_candidates(len(there), self.config.max_attempts, draw), strict=True):
-            found[row] = drawn.clip
-        return found
-
-    def _held(self, request: Request, found: Clip | Skipped) -> Candidate:
-        assert isinstance(found, Clip)
-        clip = refine_grasps(self.pair, found, self.config.contact_refinement)
-        asked = request.sentence.verb if request.sentence else None
-        known = verb_check_results(self.check, clip, request.points, asked)
-        return Candidate(clip, carried_fraction(self.pair, clip, self.config.contact_refinement), **known)
+        found = self.retrieval.sample(requests)
+        return [refine_grasps(self.pair, clip) if isinstance(clip, Clip) else clip for clip in found]
 
 
-def _held(lookup: Family) -> Family:
-    return Family(f"{lookup.name}-refined", f"{lookup.title}, refined", partial(RefinedRetrieval.load, lookup))
+def _refined(retrieval: Family) -> Family:
+    def load(sources: Sources) -> Sampler:
+        return RefinedRetrieval(retrieval.load(sources), sources.hands)
+
+    return Family(f"{retrieval.name}-refined", f"{retrieval.title}, contact refinement", load)
 
 
-PROMPT_LOOKUP_HELD, VERB_LOOKUP_HELD = _held(PROMPT_LOOKUP), _held(VERB_LOOKUP)
+PROMPT_RETRIEVAL_REFINED, VERB_RETRIEVAL_REFINED = _refined(PROMPT_LOOKUP), _refined(VERB_LOOKUP)

@@ -6,19 +6,21 @@ compares motions.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
-import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
+from hoidata.annotation.encoders import TextEncoder, load_encoder, refuse_other_encoder
+from hoidata.annotation.wording import parsed_verb
 from hoidata.batches.dataset import ClipSample, HoiDataset, collate
 from hoidata.batches.requests import Request
-from hoidata.clips.clip import Clip
+from hoidata.clips.clip import SIDES, Clip
 from hoidata.settings import build_config
+from models.baselines.contact_maps import mean_maps
 from models.common.checkpoints import load_checkpoint
 from models.common.family import Family, Figures, Skipped, Sources
-from models.common.point_net import normalised_points
 from models.common.predicting import first_sentence
 from models.text2hoi.contact_training import (
     CONTACT,
@@ -84,7 +86,8 @@ def length_metrics(sources: Sources, train: list[ClipSample], test: list[ClipSam
     assert isinstance(network, LengthModel)
     batch = collate(test)
     true = batch.lengths.numpy()
-    error = float(np.abs(network.expected_frames(batch.text[:, 0], batch.active_hands).numpy() - true).mean())
+    verbs = [parsed_verb(sample.sentences[0], network.config.verbs) for sample in test]
+    error = float(np.abs(network.expected_frames(batch.text[:, 0], verbs).numpy() - true).mean())
     baseline = float(np.abs(np.mean([sample.length for sample in train]) - true).mean())
     return {
         "clips": len(true),
@@ -94,61 +97,15 @@ def length_metrics(sources: Sources, train: list[ClipSample], test: list[ClipSam
     }
 
 
-def mean_maps(train: list[ClipSample], clips: list[ClipSample], kind: str) -> np.ndarray:
-    """Baseline contact maps (clip, point) from training clips.
-
-    kind: "index": the mean by point index. "position": the mean at the nearest points in coordinates normalised to the
-    object. "object": the mean over training clips of the same object, or over all if it is new.
-    """
-    train_maps = true_maps(train).astype(np.float64)
-    if kind == "index":
-        return np.repeat(train_maps.mean(axis=0)[None], len(clips), axis=0)
-    if kind == "object":
-        keys = np.array([sample.object_key for sample in train])
-        same = [train_maps[keys == sample.object_key] for sample in clips]
-        return np.stack([maps.mean(axis=0) if len(maps) else train_maps.mean(axis=0) for maps in same])
-    points = {sample.object_key: torch.from_numpy(sample.points.points_m)[None] for sample in [*train, *clips]}
-    clouds = {key: normalised_points(cloud)[0][0].numpy() for key, cloud in points.items()}
-    train_clouds = [clouds[sample.object_key] for sample in train]
-    of_object = {
-        key: mean_map_by_position(clouds[key], train_clouds, train_maps)
-        for key in {sample.object_key for sample in clips}
-    }
-    return np.stack([of_object[sample.object_key] for sample in clips])
+ALL_NAMES = tuple(network.name for network in NETWORKS)
+NAMES = ("contact", "diffusion", "refiner")  # networks that generate refined motions of a given length
 
 
-def mean_map_by_position(points: np.ndarray, train_clouds: list[np.ndarray], train_maps: np.ndarray) -> np.ndarray:
-    """Probability (point,) of contact at points (point, 3): the mean over training maps of their nearest points.
-
-    Points and training clouds (point, 3) are normalised to the size of their object; train_maps (clip, point).
-    """
-    probability = np.zeros(len(points))
-    for cloud, contact in zip(train_clouds, train_maps, strict=True):
-        probability += contact[KDTree(cloud).query(points)[1]]
-    return probability / max(len(train_maps), 1)
-
-
-NAMES = tuple(network.name for network in NETWORKS)
-NO_OTHER_SENTENCE = "all test clips have its sentence"
-
-
-def load_text2hoi(sources: Sources) -> Text2Hoi:
-    """The four networks with the settings of ``sample.text2hoi``."""
+def load_text2hoi(sources: Sources, **changes: Any) -> Text2Hoi:
+    """The networks with the settings of ``sample.text2hoi``, except for ``changes``."""
     config = build_config(SamplingConfig, sources.settings.get("text2hoi"), "params.yaml: sample.text2hoi")
+    config = replace(config, **changes)
     return Text2Hoi.load(sources.checkpoints, sources.hands, config, sources.device)
-
-
-@dataclass(frozen=True)
-class BeforeRefiner:
-    """Text2HOI without its refiner."""
-
-    model: Text2Hoi
-
-    def sample(self, requests: Sequence[Request]) -> list[Clip]:
-        return self.sample_with_targets(requests)[0]
-
-    def sample_with_targets(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
-        return self.model.sample_with_targets(requests, refined=False)
 
 
 @dataclass(frozen=True)
@@ -164,8 +121,10 @@ class OtherPrompt:
     def sample_with_targets(
         self, requests: Sequence[Request], contact_maps: Sequence[Tensor] | None = None
     ) -> tuple[list[Clip | Skipped], list[np.ndarray | None]]:
-        """contact_maps: as in ``Text2Hoi.motions``."""
-        answers: list[Clip | Skipped] = [Skipped(request.motion_id, NO_OTHER_SENTENCE) for request in requests]
+        """contact_maps: as in ``Text2Hoi.candidates``."""
+        answers: list[Clip | Skipped] = [
+            Skipped(request.motion_id, "all test clips have its sentence") for request in requests
+        ]
         maps: list[np.ndarray | None] = [None] * len(requests)
         indices = [index for index, request in enumerate(requests) if request.clip_id in self.other]
         given_maps = None if contact_maps is None else [contact_maps[index] for index in indices]
@@ -202,9 +161,60 @@ def other_prompts(sources: Sources) -> dict[str, ClipSample]:
     return chosen
 
 
-TEXT2HOI = Family("text2hoi", "Text2HOI", load_text2hoi, networks=NETWORKS, uses=NAMES, diagnose=diagnose)
-COARSE = Family(
-    "text2hoi-coarse", "Text2HOI before its refiner", lambda sources: BeforeRefiner(load_text2hoi(sources)), uses=NAMES
+@dataclass(frozen=True)
+class Estimated:
+    """Text2HOI with length and hand type estimated from the sentence, as in ``hoidata generate``.
+
+    The sampler of ``Text2Hoi`` is given the recorded clip's; ``encoder`` is needed for the hand type.
+    """
+
+    model: Text2Hoi
+    encoder: TextEncoder
+
+    @classmethod
+    def load(cls, sources: Sources) -> "Estimated":
+        expected = sources.annotated.encoder_identity
+        encoder = load_encoder(sources.encoder or str(expected["name"]))
+        refuse_other_encoder(sources.annotated.root, expected, encoder.identity)
+        return cls(load_text2hoi(sources), encoder)
+
+    def sample(self, requests: Sequence[Request]) -> list[Clip]:
+        return self.sample_with_targets(requests)[0]
+
+    def sample_with_targets(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
+        return self.model.sample_with_targets([self.estimated(request) for request in requests])
+
+    def estimated(self, request: Request) -> Request:
+        """The request with estimated hands and a sampled length."""
+        assert request.sentence is not None
+        hand = self.model.choose_hand(request.sentence.words, self.encoder).hand
+        active_hands = np.array([hand in (side, "both") for side in SIDES])
+        return replace(request, active_hands=active_hands, n_frames=self.model.sample_length(request))
+
+
+def hand_type_accuracy(sources: Sources) -> Figures:
+    """Fraction of test clips whose hand type is estimated correctly from their first sentence."""
+    test, model = list(HoiDataset(sources.annotated, "test", crop="start")), Estimated.load(sources)
+    hands = [model.model.choose_hand(sample.sentences[0], model.encoder).hand for sample in test]
+    correct = [hand == sample.hand_type for hand, sample in zip(hands, test, strict=True)]
+    return {"hand_type": {"clips": len(test), "accuracy": round(float(np.mean(correct)), 6)}}
+
+
+TEXT2HOI = Family("text2hoi", "Text2HOI", load_text2hoi, networks=NETWORKS, uses=ALL_NAMES, diagnose=diagnose)
+COARSE, CONTACT_REFINED = (
+    Family(name, title, partial(load_text2hoi, refine=refine), uses=("contact", "diffusion"))
+    for name, title, refine in (
+        ("text2hoi-coarse", "Text2HOI before its refiner", "none"),
+        ("text2hoi-contact", "Text2HOI, contact refinement", "contact"),
+    )
+)
+ESTIMATED = Family(
+    "text2hoi-estimated",
+    "Text2HOI, estimated length and hand type",
+    Estimated.load,
+    uses=ALL_NAMES,
+    estimates_length=True,
+    diagnose=hand_type_accuracy,
 )
 OTHER_PROMPT = Family(
     "other-prompt",

@@ -4,6 +4,7 @@ Text2HOI, Sec. 4.1, regresses the length from text and noise with a squared erro
 the noise. ``sampled_from: gaussian`` predicts a mean and a standard deviation instead, trained by likelihood.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -11,12 +12,12 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from hoidata.annotation.vocabulary import Vocabulary
 from hoidata.batches.dataset import MAX_FRAMES, ClipBatch, collate
 from hoidata.devices import send
 from models.common.corpus import Corpus, any_form
 from models.common.family import Losses, Network, Objective, Setup
-from models.common.features import TEXT_FEATURES
-from models.text2hoi.verb_classifier import Sentences, VerbClassifier, fit_verb_classifiers
+from models.common.features import TEXT_FEATURES, verb_one_hot
 
 SHORTEST_FRAMES = 8
 NOISE = 64  # random inputs of the paper's network
@@ -32,33 +33,21 @@ class LengthConfig:
     dropout: float = 0.0
     # Sample the length from random inputs of the network (the paper), or from the Gaussian that the network predicts.
     sampled_from: Literal["input_noise", "gaussian"] = "input_noise"
-    # The sentence's features, or probabilities of its verb (``verb_classifier``).
-    text_input: Literal["features", "verb_probabilities"] = "features"
-    # Verbs in training; set by training.
-    verb_count: int = 1
-    # Condition on hand flags. The name is that of the diffusion network's key; the length is the output here.
-    condition_on_hands_and_length: bool = False
-
-
-@dataclass(frozen=True)
-class LengthLossConfig:
-    """The loss's augmentation."""
-
-    jitter: float = 0.0  # relative change of lengths, at most; Text2HOI's released code has 0.05
+    # Read the verb that the grammar finds in the sentence, in addition to the sentence's features.
+    verb_input: bool = False
+    # Verbs of the training clips; set by training with ``verb_input``.
+    verbs: tuple[str, ...] = ()
 
 
 class LengthModel(nn.Module):
-    """The length, in units of 150 frames, from a sentence (B, 512), hand flags (B, 2) and noise."""
+    """The length, in units of 150 frames, from a sentence (B, 512), its verb and noise."""
 
     def __init__(self, config: LengthConfig) -> None:
         super().__init__()
         self.config = config
-        is_gaussian, has_verbs = config.sampled_from == "gaussian", config.text_input == "verb_probabilities"
-        self.reading = VerbClassifier(TEXT_FEATURES, config.verb_count) if has_verbs else None
-        text_features = config.verb_count if has_verbs else TEXT_FEATURES
-        inputs = text_features + 2 * config.condition_on_hands_and_length + (0 if is_gaussian else NOISE)
+        is_gaussian = config.sampled_from == "gaussian"
         self.layers = nn.Sequential(
-            nn.Linear(inputs, config.width),
+            nn.Linear(TEXT_FEATURES + len(config.verbs) + (0 if is_gaussian else NOISE), config.width),
             nn.ReLU() if is_gaussian else nn.LeakyReLU(0.2),
             nn.Dropout(config.dropout),
             nn.Linear(config.width, 2 if is_gaussian else 1),
@@ -68,10 +57,9 @@ class LengthModel(nn.Module):
         """(count, D) random numbers from N(0, I)."""
         return torch.randn(count, 1 if self.config.sampled_from == "gaussian" else NOISE, generator=generator)
 
-    def moments(self, text: Tensor, active_hands: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    def moments(self, text: Tensor, verbs: Sequence[str | None], noise: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log standard deviation (B,) of the length; the latter is unused with input noise (B, D)."""
-        text = text if self.reading is None else self.reading(text)
-        inputs = [text, *([active_hands.float()] if self.config.condition_on_hands_and_length else [])]
+        inputs = [text, verb_one_hot(verbs, self.config.verbs, text.device)] if self.config.verbs else [text]
         if self.config.sampled_from == "input_noise":
             length = self.layers(torch.cat((noise, *inputs), -1))[:, 0].sigmoid()
             return length, torch.zeros_like(length)
@@ -80,18 +68,18 @@ class LengthModel(nn.Module):
         return mean + 0.5, 2 * log_spread.tanh() - 3
 
     @torch.no_grad()
-    def expected_frames(self, text: Tensor, active_hands: Tensor) -> Tensor:
+    def expected_frames(self, text: Tensor, verbs: Sequence[str | None]) -> Tensor:
         """(B,) expected number of frames, not rounded."""
         count = 1 if self.config.sampled_from == "gaussian" else EXPECTATION_SAMPLES
         noise = self.draw_noise(count, torch.Generator().manual_seed(0)).to(text.device)
-        means = [self.moments(text, active_hands, sample.expand(len(text), -1))[0] for sample in noise]
+        means = [self.moments(text, verbs, sample.expand(len(text), -1))[0] for sample in noise]
         return (torch.stack(means).mean(0) * MAX_FRAMES).clamp(SHORTEST_FRAMES, MAX_FRAMES)
 
     @torch.no_grad()
-    def sample(self, text: Tensor, active_hands: Tensor, generator: torch.Generator) -> Tensor:
+    def sample(self, text: Tensor, verbs: Sequence[str | None], generator: torch.Generator) -> Tensor:
         """Sampled numbers of frames (B,), integers from 8 to 150."""
         noise = self.draw_noise(len(text), generator).to(text.device)
-        mean, log_spread = self.moments(text, active_hands, noise)
+        mean, log_spread = self.moments(text, verbs, noise)
         deviations = noise[:, 0].clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
         spread = log_spread.exp() * deviations if self.config.sampled_from == "gaussian" else 0.0
         return ((mean + spread) * MAX_FRAMES).round().clamp(SHORTEST_FRAMES, MAX_FRAMES).long()
@@ -113,47 +101,39 @@ def length_loss(mean: Tensor, log_spread: Tensor, frames: Tensor) -> dict[str, T
     return {"total": total, "square": square.mean(), "likelihood": likelihood.mean()}
 
 
-def jittered_frames(lengths: Tensor, jitter: float, generator: torch.Generator) -> Tensor:
-    """Lengths times random factors between 1 - ``jitter`` and 1 + ``jitter``."""
-    factor = 1 + jitter * (2 * torch.rand(len(lengths), generator=generator) - 1)
-    return lengths * send(factor, lengths.device)
-
-
 class LengthObjective:
     """Loss of the length network: Text2HOI, Sec. 4.1, or a Gaussian likelihood."""
 
     frames = entries = 0
 
-    def __init__(self, network: LengthModel, loss: LengthLossConfig, corpus: Corpus, device: torch.device) -> None:
-        self.network, self.loss, self.corpus, self.device = network, loss, corpus, device
+    def __init__(self, network: LengthModel, corpus: Corpus, device: torch.device) -> None:
+        self.network, self.corpus, self.device = network, corpus, device
 
     @cached_property
     def held_out(self) -> ClipBatch:
         return collate(self.corpus.held_out).to(self.device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
-        frames = jittered_frames(batch.lengths, self.loss.jitter, generator)
         noise = send(self.network.draw_noise(len(batch), generator), self.device)
-        mean, log_spread = self.network.moments(any_form(batch, generator), batch.active_hands, noise)
+        verbs = [sample.verb for sample in batch.samples]
+        mean, log_spread = self.network.moments(any_form(batch, generator), verbs, noise)
         is_gaussian = self.network.config.sampled_from == "gaussian"
-        return length_loss(mean, log_spread, frames) if is_gaussian else length_error(mean, frames)
+        return length_loss(mean, log_spread, batch.lengths) if is_gaussian else length_error(mean, batch.lengths)
 
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, LengthModel)
         batch = self.held_out
-        errors = [
-            (network.expected_frames(batch.text[:, form], batch.active_hands) - batch.lengths).abs()
-            for form in range(batch.text.shape[1])
-        ]
+        verbs, forms = [sample.verb for sample in batch.samples], range(batch.text.shape[1])
+        errors = [(network.expected_frames(batch.text[:, form], verbs) - batch.lengths).abs() for form in forms]
         return torch.stack(errors).mean()
 
 
 def _objective(setup: Setup) -> tuple[Objective, None]:
-    sentences = Sentences.of(setup.corpus.train if setup.network.text_input == "verb_probabilities" else ())
-    network = LengthModel(replace(setup.network, verb_count=sentences.n_verbs))
-    fit_verb_classifiers(network, sentences)
-    return LengthObjective(network.to(setup.device), setup.loss, setup.corpus, setup.device), None
+    config = setup.network
+    if config.verb_input:
+        config = replace(config, verbs=tuple(Vocabulary.of(setup.corpus.train).verb_names))
+    return LengthObjective(LengthModel(config).to(setup.device), setup.corpus, setup.device), None
 
 
-LENGTH = Network("length", LengthConfig, build=LengthModel, objective=_objective, loss=LengthLossConfig)
+LENGTH = Network("length", LengthConfig, build=LengthModel, objective=_objective)

@@ -1,11 +1,13 @@
 """The hand refiner: moves generated hands out of the object and onto its surface.
 
 Text2HOI, Sec. 3.3 and supplement, Table S10: a Transformer over left- and right-hand tokens; the object does not move.
-Each deviation from the paper is a setting, off by default:
 
-- ``view: object`` works in the object's frame, where the same contact has the same features in every motion.
-- ``surface_input`` adds the signed displacement to the surface. The attention map is the same inside and outside.
-- ``output: residual`` starts at zero. Only the last layer is zero, so that all layers learn from the first step.
+``output: residual`` deviates from the paper:
+
+- Hands, joints and displacements are in the object's frame, where the same contact has the same features.
+- The signed displacement to the surface is an input, since the attention map is the same inside and outside. The
+  contact map and the points' norms are not.
+- The network predicts a correction that starts at zero, projected to splines so that it does not jitter.
 """
 
 from collections.abc import Iterable
@@ -45,6 +47,9 @@ from models.common.transformer import (
 JOINT_FEATURES = 63
 ATTENTION_RATE_PER_M = 50.0
 REACH_M = 0.05
+WRIST_UNIT_M, ROTATION_UNIT = 0.05, 0.3  # corrections of the wrist and of 6D rotations for a network output of one
+KNOT_FRAMES = 4  # frames between the knots of a correction
+FIELD_RESOLUTION = 48  # points of the distance grids along each axis
 
 
 @dataclass(frozen=True)
@@ -52,20 +57,8 @@ class RefinerConfig:
     """Sizes and inputs of the refiner; the defaults are the paper's."""
 
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
-    # Read the contact map, and the distance of each object point from the origin.
-    contact_map: bool = True
-    # Frame of hands, joints and displacements.
-    view: Literal["world", "object"] = "world"
-    # Read signed distances and displacements to the surface.
-    surface_input: bool = False
-    # Predict the hands, or a correction.
+    # Predict the hands in the world, or a correction in the object's frame.
     output: Literal["hands", "residual"] = "hands"
-    # A network output of one corrects the wrist by this many metres.
-    wrist_unit_m: float = 1.0
-    # A network output of one corrects a 6D rotation number by this much.
-    rotation_unit: float = 1.0
-    # The output is projected to splines with a knot every so many frames, so that corrections do not jitter; 0: not.
-    knot_frames: int = 0
 
 
 @dataclass(frozen=True)
@@ -79,7 +72,7 @@ class CoarseMotion:
     offset_m: Tensor  # (B, 2, F, 21, 3) from joints to the nearest surface point, in the object's frame
     present: Tensor  # (B, 2, F) bool, frames with each hand
     batch: RequestBatch  # objects and lengths of the motions
-    contact_map: Tensor  # (B, N) 0 or 1
+    contact_map: Tensor  # (B, N) probabilities, or 0 or 1
 
 
 def attention_map(offset_m: Tensor) -> Tensor:
@@ -94,27 +87,27 @@ class RefinerModel(nn.Module):
 
     def __init__(self, config: RefinerConfig) -> None:
         super().__init__()
-        self.config = config
+        self.config, self.is_residual = config, config.output == "residual"
         width, frames_per_token = config.transformer.width, config.transformer.frames_per_token
-        inputs = HAND_FEATURES + 2 * JOINT_FEATURES + (JOINT_FEATURES + 21) * config.surface_input
-        inputs += 2 * POINT_COUNT * config.contact_map
+        inputs = HAND_FEATURES + 2 * JOINT_FEATURES + (JOINT_FEATURES + 21 if self.is_residual else 2 * POINT_COUNT)
         self.hands_in = nn.ModuleList([nn.Linear(inputs * frames_per_token, width) for _ in range(2)])
         self.encoder = Encoder(config.transformer)
         self.hands_out = nn.ModuleList([nn.Linear(width, HAND_FEATURES * frames_per_token) for _ in range(2)])
-        for layer in self.hands_out if config.output == "residual" else ():
+        # Only the last layer is zero, so that all layers learn from the first step.
+        for layer in self.hands_out if self.is_residual else ():
             nn.init.zeros_(layer.weight)  # pyright: ignore[reportArgumentType]
             nn.init.zeros_(layer.bias)  # pyright: ignore[reportArgumentType]
-        reach = torch.full((HAND_FEATURES,), config.rotation_unit)
-        reach[WRIST] = config.wrist_unit_m
+        reach = torch.full((HAND_FEATURES,), ROTATION_UNIT if self.is_residual else 1.0)
+        reach[WRIST] = WRIST_UNIT_M if self.is_residual else 1.0
         self.register_buffer("reach", reach, persistent=False)
 
     def forward(self, coarse: CoarseMotion) -> Tensor:
         """Refined hands (B, 2, F, 99) in the world."""
         hands = self.corrected(coarse)
-        return hands_in_world(hands, coarse.object) if self.config.view == "object" else hands
+        return hands_in_world(hands, coarse.object) if self.is_residual else hands
 
     def corrected(self, coarse: CoarseMotion) -> Tensor:
-        """Refined hands (B, 2, F, 99) in the frame ``config.view``.
+        """Refined hands (B, 2, F, 99) in the frame of ``in_view``.
 
         Absent hands and padding are masked; their outputs are meaningless.
         """
@@ -134,39 +127,31 @@ class RefinerModel(nn.Module):
             to_frames(layer(x), n_frames, frames_per_token) for layer, x in zip(self.hands_out, encoded, strict=True)
         ]
         residual = torch.stack(change, 1)
-        if self.config.knot_frames:
-            residual = projected(residual, list(coarse.batch.counts), self.config.knot_frames)
-        return local + residual * self.reach if self.config.output == "residual" else residual
+        if not self.is_residual:
+            return residual
+        return local + projected(residual, list(coarse.batch.counts), KNOT_FRAMES) * self.reach
 
     def in_view(self, hands: Tensor, objects: Tensor) -> Tensor:
-        """World hands (B, 2, F, 99) in the frame ``config.view``, given objects (B, F, 10)."""
-        return hands_in_object_frame(hands, objects) if self.config.view == "object" else hands
+        """World hands (B, 2, F, 99) in the network's frame: the world, or the object (B, F, 10) for a residual."""
+        return hands_in_object_frame(hands, objects) if self.is_residual else hands
 
     def _inputs(self, coarse: CoarseMotion, local: Tensor) -> Tensor:
-        """Input features (B, 2, F, D): hands, joints, attention map, and what the config adds."""
-        config, objects = self.config, coarse.object
+        """Input features (B, 2, F, D): hands, joints, attention map, and displacements or object points."""
         joints, offset = coarse.joints_m, coarse.offset_m
-        if config.view == "world":
-            rotation_transposed = object_rotmat(objects)[:, None].transpose(-1, -2)
-            joints, offset = (
-                joints @ rotation_transposed + object_position_m(objects)[:, None, :, None],
-                offset @ rotation_transposed,
-            )
-        # Metres near the object are small numbers; ten times as large they are comparable to rotations.
-        scale = 10 if config.view == "object" else 1
-        parts = [local[..., WRIST] * scale, local[..., HAND_ROTATIONS_6D], (joints * scale).flatten(-2)]
-        parts.append(attention_map(offset).flatten(-2))
-        if config.surface_input:
+        if self.is_residual:
+            # Metres near the object are small numbers; ten times as large they are comparable to rotations.
+            parts = [local[..., WRIST] * 10, local[..., HAND_ROTATIONS_6D], (joints * 10).flatten(-2)]
             # Bounded direction to the surface: a unit vector far away, zero on the surface.
-            direction = coarse.offset_m / (coarse.offset_m.norm(dim=-1, keepdim=True) + REACH_M)
-            parts += [direction.flatten(-2) * 2, (coarse.distance_m / REACH_M).clamp(-2, 2)]
-        if config.contact_map:
-            shape = (*local.shape[:-1], POINT_COUNT)
-            # In the object's frame the norms of the points do not change with the motion.
-            points = coarse.batch.points_m[:, None] if config.view == "object" else place_points(coarse.batch, objects)
-            norms = points.norm(dim=-1)
-            parts += [norms[:, None].expand(shape), coarse.contact_map[:, None, None].expand(shape)]
-        return torch.cat(parts, -1)
+            direction = offset / (offset.norm(dim=-1, keepdim=True) + REACH_M)
+            distance = (coarse.distance_m / REACH_M).clamp(-2, 2)
+            return torch.cat((*parts, attention_map(offset).flatten(-2), direction.flatten(-2) * 2, distance), -1)
+        rotation_transposed = object_rotmat(coarse.object)[:, None].transpose(-1, -2)
+        joints = joints @ rotation_transposed + object_position_m(coarse.object)[:, None, :, None]
+        shape = (*local.shape[:-1], POINT_COUNT)
+        norms = place_points(coarse.batch, coarse.object).norm(dim=-1)[:, None].expand(shape)
+        contact_map = coarse.contact_map[:, None, None].expand(shape)
+        attention = attention_map(offset @ rotation_transposed)
+        return torch.cat((local, joints.flatten(-2), attention.flatten(-2), norms, contact_map), -1)
 
 
 @torch.no_grad()
@@ -182,9 +167,9 @@ class Surface:
         self.hands, self.fields = hands, fields
 
     @classmethod
-    def of(cls, hands: Hands, objects: Iterable[ObjectModel], resolution: int, device: torch.device) -> "Surface":
-        """Distance grids of these objects, one per name; ``resolution`` grid points along each axis."""
-        fields = DistanceFields([(model.name, model) for model in objects], resolution)
+    def of(cls, hands: Hands, objects: Iterable[ObjectModel], device: torch.device) -> "Surface":
+        """Distance grids of these objects, one per name."""
+        fields = DistanceFields([(model.name, model) for model in objects], FIELD_RESOLUTION)
         return cls(hands.to(device), fields.to(device))
 
     def coarse(
@@ -193,7 +178,7 @@ class Surface:
         """The refiner's input from generated hands (B, 2, F, 99) and objects (B, F, 10) in the model frame.
 
         Args:
-            contact_map: (B, N) 0 or 1.
+            contact_map: (B, N), from 0 to 1.
             present: (B, 2, F) bool, frames with each hand.
         """
         joints = self.hands.joints(hands, batch.betas, batch.template_m)

@@ -67,27 +67,39 @@ def generate(
     ] = "",
     sampler: Annotated[
         Literal["ddim", "ddpm", "dpm++"] | None,
-        typer.Option(help="Diffusion sampler. Default: the one in params.yaml, ddim as delivered."),
+        typer.Option(help="Diffusion sampler. Default: params.yaml; without it ddim, ddpm for preset paper."),
     ] = None,
     steps: Annotated[
         int | None,
-        typer.Option(help="Number of denoising steps. Default: from params.yaml, 20 as delivered.", min=1, max=1000),
+        typer.Option(
+            help="Number of denoising steps. Default: params.yaml; without it 20, 1000 for preset paper.",
+            min=1,
+            max=1000,
+        ),
     ] = None,
-    scale: Annotated[
-        float | None,
-        typer.Option(help="Classifier-free guidance scale; 1 means no guidance. Default: from params.yaml."),
+    refine: Annotated[
+        Literal["network", "contact", "none"] | None,
+        typer.Option(
+            help="What corrects the hands: the refiner network, contact refinement by optimisation, or nothing. "
+            "Default: params.yaml; without it network."
+        ),
+    ] = None,
+    attempts: Annotated[
+        int | None,
+        typer.Option(help="Rejection sampling: the best of at most so many motions. Default: params.yaml, 1.", min=1),
     ] = None,
     unit: Unit = "",
     up: Up = "",
     hinge: MeshHinge = "",
     hand_by: Annotated[
-        Literal["rules", "similarity"],
+        Literal["rules", "similarity"] | None,
         typer.Option(
             help="How to choose the hands without --hand. rules: grammar rules; for a phrase they do not cover, the "
             "similarity of text features; for a sentence without a hand, the most frequent one in training. "
-            "similarity: Text2HOI's method, the most similar of three phrases."
+            "similarity: Text2HOI's method, the most similar of three phrases. Default: rules; similarity for preset "
+            "paper."
         ),
-    ] = "rules",
+    ] = None,
     profile: Profile = "",
     encoder: Annotated[
         str,
@@ -102,7 +114,7 @@ def generate(
     mesh = Path(object).resolve() if isfile(object) else None
     _refuse_ineffective(
         {"--model": models and model, "--profile": models and profile, "--encoder": not models and encoder}
-        | {"--hand-by": hand and hand_by != "rules"}
+        | {"--hand-by": hand and hand_by}
         | ({} if mesh or Path(object).suffix else {"--unit": unit, "--up": up, "--hinge": hinge})
     )
     root = enter_project() if models is None else None
@@ -118,15 +130,17 @@ def generate(
         model_source = {"profile": profile or current_profile(), "datasets": tuple(read_params(root)["datasets"])}
     if length is not None and not isfinite(length * FPS):
         raise BadInput("--length", "seconds", f"{length:g}", "omit it for a length that the network predicts")
-    overrides = {"kind": sampler, "steps": steps, "guidance": scale}
+    given = {"kind": sampler, "steps": steps}, {"refine": refine, "attempts": attempts}
+    of_sampler, of_sampling = ({name: value for name, value in one.items() if value is not None} for one in given)
     frames = None if length is None else round(length * FPS)
     request = GenerationRequest(
         text,
         mesh or object,
         model=model,
-        wish=MotionOptions(seed=seed, samples=samples, hand=hand, frames=frames, hand_by=hand_by),
+        options=MotionOptions(seed=seed, samples=samples, hand=hand, frames=frames, hand_by=hand_by),
         mesh=MeshOptions(unit, up, hinge),
-        sampler={name: value for name, value in overrides.items() if value is not None},
+        sampler=of_sampler,
+        sampling=of_sampling,
         force=force,
         **model_source,
     )

@@ -36,7 +36,7 @@ ARRAYS = {
     "contact_part": "(P,) 1 where the hinge moves the point",
     "contact": "(P,) the target contact map of the motion",
 }
-REFINED_BY = {"contact_refinement": "contact refinement by optimisation", "network": "the refiner network"}
+REFINED_BY = {"contact": "contact refinement by optimisation", "network": "the refiner network", "none": "nothing"}
 
 
 def write_generation(
@@ -117,21 +117,21 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
     """(name, value) facts of the motions: hands and why, length, object, seed, models, training data."""
     evidence, clip = motions[0].evidence, motions[0].clip
     hand = evidence["hand"]
-    kind, verb = "SYNTHETIC" if evidence["synthetic"] else "recorded", evidence["read_as"]
+    kind, verb = "SYNTHETIC" if evidence["synthetic"] else "recorded", evidence["verb"]
     clips = ", ".join(f"{count} {kind} {name} clips" for name, count in evidence["trained_on"].items())
     lengths = [f"{shown.clip.n_frames} frames, {shown.clip.n_frames / FPS:.2f} s at {FPS} fps" for shown in motions]
     digests = ", ".join(f"{name} {digest[:12]}" for name, digest in evidence["checkpoints"].items())
     resampled = [
-        f"sample {shown.evidence['number'] + 1}: the best of {shown.evidence['draws']} motions; the others did not "
+        f"sample {shown.evidence['number'] + 1}: the best of {shown.evidence['attempts']} motions; the others did not "
         "carry the object or moved unlike the verb"
         for shown in motions
-        if shown.evidence["draws"] > 1
+        if shown.evidence["attempts"] > 1
     ]
     return [
         ("hands", f"{hand['hand']} (decided by {hand['source']}: {hand['evidence']})"),
         ("length", "; ".join(lengths)),
         ("object", clip.object_words),
-        *([("verb of the prompt", f"classified as {verb[0]} ({verb[1]:.0%})")] if verb else []),
+        *([("verb of the prompt", verb)] if verb else []),
         ("seed", str(evidence["seed"])),
         *[
             ("compared with training", f"sample {shown.evidence['number'] + 1}: {words}")
@@ -140,7 +140,7 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
         ],
         *([("rejection sampling", "; ".join(resampled))] if resampled else []),
         ("trained on", clips),
-        ("refined by", REFINED_BY[evidence["refined_by"]]),
+        ("refined by", REFINED_BY[evidence["refine"]]),
         ("checkpoints", f"{checkpoints} (sha256: {digests})"),
         *[("not in training", note) for note in evidence["unseen"]],
     ]
@@ -148,8 +148,8 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
 
 def _compared(motion: GeneratedMotion) -> str:
     """Motion measures outside the range of the verb's training clips, and the nearest verb if it is another one."""
-    verb, nearest_verb = motion.evidence["read_as"], motion.evidence["moved_as"]
-    is_other = verb and nearest_verb and nearest_verb != verb[0]
+    verb, nearest_verb = motion.evidence["verb"], motion.evidence["moved_as"]
+    is_other = verb and nearest_verb and nearest_verb != verb
     return ", ".join([*([f"motion classified as {nearest_verb!r}"] if is_other else []), *motion.evidence["unusual"]])
 
 

@@ -37,6 +37,7 @@ def sample(paths: StagePaths, params: dict, family: str) -> None:
         section,
         load_hands(paths.profile),
         settings=settings,
+        encoder=(params.get("annotate") or {}).get("encoder", ""),
         device=chosen_device(params.get("device", "auto")),
     )
     print(f"{paths}: {counts['clips']} motions")

@@ -8,12 +8,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from hoidata.annotation.encoders import not_clip_note
+from hoidata.annotation.settings import AnnotationSettings
 from hoidata.files import sha256_file
 from models.registry import load_network
 from pipelines.lineage.graph import producers, written_graph
 from pipelines.lineage.provenance import build_provenance
 from pipelines.params import merge_settings, read_file, read_params
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, write_empty
+
+SENTENCE_READERS = ("contact", "length", "diffusion")  # networks that read sentence features
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,11 @@ def run(paths: StagePaths) -> None:
 
 def train(paths: StagePaths) -> None:
     """Run one of the processes that train ``paths.model``."""
-    params = load_settings(TrainParams, "train").of(paths.model)
+    settings = load_settings(TrainParams, "train")
+    params = settings.of(paths.model)
+    encoder = (read_params(Path()).get("annotate") or {}).get("encoder", AnnotationSettings.encoder)
+    if settings.preset == "paper" and paths.model in SENTENCE_READERS and (note := not_clip_note(encoder)):
+        print(f"{paths.model}: {note}")
     code = Path("code", "train", f"{paths.model}.json")
     train_into(paths.checkpoint, paths, params, paths.training, code)
 

@@ -16,7 +16,7 @@ from models.common.family import Sources
 from tests.builders.clips import clip_of, flat_hand
 from tests.builders.objects import box_model, notebook
 from tests.builders.stores import write_annotated
-from tests.models.toy import FAST, PARAMS, train
+from tests.models.toy import FAST, PAPER, PARAMS, train
 
 GRASP_HEIGHT_M = 0.01
 
@@ -102,6 +102,15 @@ def trained(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     out = tmp_path_factory.mktemp("checkpoints")
     for name in PARAMS:
         train(name, annotated_root, out)
+    return out
+
+
+@pytest.fixture(scope="session")
+def paper_trained(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As ``trained``, with networks of preset `paper`."""
+    out = tmp_path_factory.mktemp("paper")
+    for name in PAPER:
+        train(name, annotated_root, out, params=PAPER)
     return out
 
 

@@ -21,7 +21,7 @@ from torch.utils.backend_registration import _setup_privateuseone_for_python_bac
 
 from hoidata.batches.dataset import collate
 from hoidata.batches.frame_selection import FrameSelection
-from hoidata.batches.requests import Request
+from hoidata.batches.requests import Request, collate_requests
 from hoidata.hands import load_embedded_hands
 from hoidata.settings import build_config
 from hoidata.store.annotated import load_annotated
@@ -100,10 +100,8 @@ def paths(root: Path, checkpoints: Path) -> Iterator[tuple[str, Callable[[], obj
             yield f"train {network.name} {preset}", lambda n=network, p=preset: trained(n, p, corpus, stored)
     requests = [request for sample in corpus.train for request in requests_for(sample, PredictionConfig(1))]
     for kind in ("ddim", "ddpm", "dpm++"):
-        for guidance in (1.0, 2.0):
-            name = f"sample and refine by {kind}, guidance {guidance:g}"
-            config = SamplerConfig(kind, 3, guidance)
-            yield name, lambda c=config: sampled(stored, c, requests)
+        config = SamplerConfig(kind, 3)
+        yield f"sample and refine by {kind}", lambda c=config: sampled(stored, c, requests)
     yield "decode control points of ours", control_points_of_ours
     yield "sample lengths", lambda: lengths(stored, requests)
 
@@ -130,16 +128,9 @@ def trained(network: Network, preset: str, corpus: Corpus, stored: dict[str, Che
             merge_settings(ours.get("network", {}), PARAMS[network.name]["network"]),
             ours.get("loss", {}),
         )
+    # Objects are scaled on the host.
+    loss_settings = {name: value for name, value in loss_settings.items() if name != "max_scaling"}
     config = build_config(network.config, network_settings, network.name)
-    if network.name == "refiner":
-        # Swapped contact maps are chosen by values on the host, once before the first step.
-        loss_settings = {
-            **loss_settings,
-            "samples": 2,
-            "sampler_steps": 2,
-            "field_resolution": 16,
-            "swap_contact_maps": False,
-        }
     weights = build_config(network.loss, loss_settings, network.name) if network.loss else None
     hands = Hands(load_embedded_hands())
     setup = Setup(
@@ -184,11 +175,13 @@ def copied() -> None:
 
 def sampled(stored: dict[str, Checkpoint], sampler: SamplerConfig, requests: list[Request]) -> None:
     pair = load_embedded_hands()
-    config = SamplingConfig(sampler, 16, "network")
-    model = Text2Hoi(on_device(stored), Hands(pair), config, device=DEVICE, pair=pair)
-    motions = model.motions(requests)
-    assert len(motions) == len(requests)
-    assert motions[0].refined.shape == (2, requests[0].n_frames, 99)
+    model = Text2Hoi(on_device(stored), Hands(pair), SamplingConfig(sampler), device=DEVICE, pair=pair)
+    batch, generators = collate_requests(requests).to(DEVICE), [torch.Generator().manual_seed(0) for _ in requests]
+    contact = model.sample_contact(batch, generators)
+    hands, objects = model.denoise(batch, [None] * len(requests), contact, generators)
+    surface = model._surface(requests)
+    assert surface is not None
+    assert model.refine(batch, hands, objects, contact, surface).shape == hands.shape
 
 
 def control_points_of_ours() -> None:
@@ -200,9 +193,7 @@ def control_points_of_ours() -> None:
     objects = torch.zeros(2, object_points, representation.object_features, device=DEVICE)
     points_m, part = torch.zeros(2, 16, 3, device=DEVICE), torch.zeros(2, 16, dtype=torch.uint8, device=DEVICE)
     with step():
-        hands, objects = representation.features_per_frame(
-            *representation.snapped_to_rest(hands, objects, counts), counts
-        )
+        hands, objects = representation.features_per_frame(hands, objects, counts)
         objects_at_origin = representation.at_origin(objects, points_m, part)
         hands, objects = recentred(representation.in_world(hands, objects), objects_at_origin)
     assert (hands.shape, objects.shape) == ((2, 2, 40, 99), (2, 40, 10))
@@ -211,8 +202,7 @@ def control_points_of_ours() -> None:
 def lengths(stored: dict[str, Checkpoint], requests: list[Request]) -> None:
     network = on_device(stored)["length"].network
     text = torch.stack([torch.from_numpy(request.text) for request in requests]).to(DEVICE)
-    hands = torch.stack([torch.from_numpy(request.active_hands) for request in requests]).to(DEVICE)
-    frames = network.sample(text, hands, torch.Generator().manual_seed(0))  # pyright: ignore[reportCallIssue]
+    frames = network.sample(text, ["lift"] * len(text), torch.Generator().manual_seed(0))  # pyright: ignore[reportCallIssue]
     assert frames.device == DEVICE
 
 

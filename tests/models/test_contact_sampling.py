@@ -9,10 +9,10 @@ from torch import Tensor
 
 from hoidata.batches.dataset import ClipBatch
 from hoidata.contact.maps import f1_score
-from models.common.point_net import PointNetConfig
+from models.common.point_net import PointNetConfig, spread_out
 from models.text2hoi.contact import AnchoredContact, ContactConfig, by_hand_loss, sample_indices
 from models.text2hoi.contact_training import most_typical
-from models.text2hoi.diffusion import TOKEN_FEATURES, contact_tokens, spread_out
+from models.text2hoi.diffusion import TOKEN_FEATURES, contact_tokens
 
 POINT_NET = PointNetConfig(widths=(16, 32, 64), heads=(32, 16), align=False)
 
@@ -78,7 +78,8 @@ def test_a_clips_maps_do_not_depend_on_the_others_in_the_batch(batch: ClipBatch)
     model = network().eval()
     latents = model.draw_latents(2, 3, torch.Generator().manual_seed(0))
     many = model.sample(batch, batch.text[:, 0], latents)
-    single = replace(batch, points_m=batch.points_m[1:2], active_hands=batch.active_hands[1:2])
+    parts = {name: getattr(batch, name)[1:2] for name in ("points_m", "active_hands", "scale_m")}
+    single = replace(batch, **parts)
     one = model.sample(single, batch.text[1:2, 0], latents[:, 1:2])
     torch.testing.assert_close(many[1:2], one, atol=1e-5, rtol=1e-4)
 
@@ -124,19 +125,21 @@ def test_an_anchored_network_learns_two_modes(batch: ClipBatch) -> None:
     top = torch.arange(8)[:, None] % 2 == 0
     contact = torch.stack((torch.zeros_like(high), high == top), 1).float()
     active_hands = batch.active_hands[right].expand(8, -1)
-    repeated = replace(batch, active_hands=active_hands)
+    repeated = replace(batch, active_hands=active_hands, scale_m=batch.scale_m[right].expand(8))
     text = batch.text[right, 0].expand(8, -1)
     model, generator = network(), torch.Generator().manual_seed(0)
     optimiser = torch.optim.Adam(model.parameters(), lr=1e-2)
     for _ in range(150):
         chosen = torch.randperm(points.shape[1], generator=generator)[:256]
-        touch, logits = model.losses(points[:, chosen], text, repeated, contact[..., chosen], generator)
+        touch, logits = model.losses(
+            replace(repeated, points_m=points[:, chosen]), text, contact[..., chosen], generator
+        )
         optimiser.zero_grad()
         terms = by_hand_loss(touch, logits, contact[..., chosen], active_hands)
         (terms["cross_entropy"] + terms["dice"] + terms["touch"]).backward()
         optimiser.step()
     latents = model.eval().draw_latents(16, 1, torch.Generator().manual_seed(1))
-    single = replace(batch, points_m=points[:1], active_hands=active_hands[:1])
+    single = replace(repeated, points_m=points[:1], active_hands=active_hands[:1], scale_m=repeated.scale_m[:1])
     maps = model.sample(single, text[:1], latents)[0, :, 1] > 0.5
     kinds = [best_of(contact_map, contact[:2, 1] > 0) for contact_map in maps]
     assert {region for region, _ in kinds} == {0, 1}

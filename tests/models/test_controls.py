@@ -3,7 +3,6 @@
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,17 +13,16 @@ from hoidata.batches.requests import Request
 from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.metrics.target_contact import read_target_contact
-from hoidata.refinement import GraspSettings, refine_grasps
+from hoidata.refinement import refine_grasps
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
 from models.baselines.controls import HANDS_AWAY_M
-from models.baselines.retrieval import NEAREST_CLIP, Prompt, Retrieval, by_sentence, of_the_hand
+from models.baselines.retrieval import Prompt, Retrieval, by_sentence, of_the_hand
 from models.common.family import Skipped, Sources
 from models.common.predicting import PredictionConfig, requests_for, sample_family
 from models.registry import load_family
-from models.text2hoi.controls import OtherContact, OwnContact, RefinedRetrieval, other_contact_maps
+from models.text2hoi.controls import OtherContact, OwnContact, other_contact_maps
 from models.text2hoi.sampler import Text2Hoi
-from models.text2hoi.verb_check import VerbCheck
 
 HANDS = load_embedded_hands()
 PERTURBED = ("static", "reversed", "object-moved", "hands-away", "pressed", "noise")
@@ -106,49 +104,10 @@ def test_refined_retrieval_is_retrieval_with_contact_refinement(sources, test):
         retrieved, refined = (
             motions(sources, name, sample)[0] for name in ("prompt-retrieval", "prompt-retrieval-refined")
         )
-        side, expected = acting(sample), refine_grasps(HANDS, retrieved, GraspSettings())
+        side, expected = acting(sample), refine_grasps(HANDS, retrieved)
         np.testing.assert_array_equal(refined.object.translation_m, expected.object.translation_m)
         np.testing.assert_array_equal(joints(refined, side), track_joints(expected.hands[side], HANDS[side]))
         assert np.abs(joints(refined, side) - joints(retrieved, side)).max() > 1e-4
-
-
-def test_refined_retrieval_is_resampled_by_the_rules_of_text2hoi(sources, test, monkeypatch):
-    """The next clip of the ranking, or the least unusual clip if none is usual."""
-    sample, several = test[0], requests_for(test[0], PredictionConfig(samples=2))
-    family = RefinedRetrieval.load(NEAREST_CLIP, replace(sources, settings={"text2hoi": {"max_attempts": 3}}))
-    plain = NEAREST_CLIP.load(sources)
-    ranked = [plain.sample([replace(several[0], number=number)])[0] for number in range(6)]
-    places = [refine_grasps(HANDS, ranked_clip, GraspSettings()).object.translation_m for ranked_clip in ranked]
-    for beyond, taken in (([0, 0], [0, 1]), ([3, 0, 2, 1], [2, 1]), ([0, 3, 0], [0, 2]), ([1, 2, 1, 2, 1, 2], [0, 1])):
-        left = [float(ranked_clip) for ranked_clip in beyond]
-        monkeypatch.setattr(VerbCheck, "fails", lambda self, verb, moved_as: False)
-        monkeypatch.setattr(VerbCheck, "beyond", lambda self, verb, numbers, left=left: left.pop(0))
-        monkeypatch.setattr("models.text2hoi.controls.carried_fraction", lambda *requested_verbs: 1.0)
-        refined = family.sample(several)
-        assert left == []
-        for one, number in zip(refined, taken, strict=True):
-            np.testing.assert_array_equal(one.object.translation_m, places[number])
-    monkeypatch.undo()
-    # The second of three has no clip to look up; hands of the third carry at the second try.
-    monkeypatch.setattr(VerbCheck, "beyond", lambda self, verb, numbers: 0.0)
-    monkeypatch.setattr(VerbCheck, "fails", lambda self, verb, moved_as: False)
-    shares = [1.0, 0.0, 1.0]
-    monkeypatch.setattr("models.text2hoi.controls.carried_fraction", lambda *requested_verbs: shares.pop(0))
-    nowhere = replace(several[0], motion_id="nowhere")
-    lookup = SimpleNamespace(
-        sample=lambda verb: [
-            Skipped("nowhere", "no clip") if one.motion_id == "nowhere" else plain.sample([one])[0] for one in verb
-        ]
-    )
-    refined = replace(family, lookup=lookup).sample([several[0], nowhere, several[1]])
-    assert isinstance(refined[1], Skipped)
-    for one, number in ((refined[0], 0), (refined[2], 2)):
-        np.testing.assert_array_equal(one.object.translation_m, places[number])
-    monkeypatch.undo()
-    requested_verbs = []
-    monkeypatch.setattr(VerbCheck, "fails", lambda self, verb, moved_as: requested_verbs.append(verb) or True)
-    family.sample(several)
-    assert requested_verbs == [sample.verb] * 6
 
 
 def test_static_repeats_the_first_frame_with_contact(sources, annotated, test):
@@ -332,15 +291,16 @@ def test_a_given_contact_map_replaces_only_the_sampled_one(sources, test):
     assert isinstance(model, Text2Hoi)
     requests = requests_of(test[0])
     sampled_maps = model.contact_maps(requests)
-    plain, same = model.motions(requests), model.motions(requests, contact_maps=sampled_maps)
+    plain, same = model.answers(requests), model.answers(requests, contact_maps=sampled_maps)
     for one, two in zip(plain, same, strict=True):
-        assert torch.equal(one.refined, two.refined)
+        assert torch.equal(one.coarse, two.coarse)
+        np.testing.assert_array_equal(joints(one.clip, acting(test[0])), joints(two.clip, acting(test[0])))
     flipped_maps = [1 - contact_map.amax(0) for contact_map in sampled_maps]
-    other = model.motions(requests, contact_maps=flipped_maps)
+    other = model.answers(requests, contact_maps=flipped_maps)
     assert all(
-        torch.equal(motion.contact_map, flipped_map) for motion, flipped_map in zip(other, flipped_maps, strict=True)
+        torch.equal(motion.touched, flipped_map > 0) for motion, flipped_map in zip(other, flipped_maps, strict=True)
     )
-    assert not torch.equal(other[0].refined, plain[0].refined)
+    assert not torch.equal(other[0].coarse, plain[0].coarse)
 
 
 def test_other_contact_is_the_map_with_least_overlap_on_the_same_object(sources, test):

@@ -20,7 +20,7 @@ NAMES = [
         for preset in ("paper", "ours")
         for name in ("contact", "length", "diffusion", "refiner")
     ),
-    *(f"sample and refine by {kind}, guidance {scale}" for kind in ("ddim", "ddpm", "dpm++") for scale in (1, 2)),
+    *(f"sample and refine by {kind}" for kind in ("ddim", "ddpm", "dpm++")),
     "decode control points of ours",
     "sample lengths",
 ]

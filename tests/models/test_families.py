@@ -15,23 +15,24 @@ from hoidata.batches.requests import Sentence
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.contact.maps import f1_score
 from hoidata.errors import BadInput
-from hoidata.hands import HandPair, load_embedded_hands, track_joints
+from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.metrics.target_contact import read_target_contact
-from hoidata.refinement import GraspSettings, refined_tracks
+from hoidata.metrics.verb_ranges import VerbRanges
+from hoidata.refinement import refine_grasps
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
+from models.baselines.contact_maps import mean_map_by_position
 from models.baselines.retrieval import Retrieval
 from models.common.family import Sources, motion_clip
 from models.common.predicting import PredictionConfig, ReportsContact, requests_for, sample_family, spread
 from models.registry import family_names, load_family, load_network
 from models.text2hoi.contact_training import best_threshold, mean_f1
-from models.text2hoi.family import OtherPrompt, mean_map_by_position, other_prompts
-from models.text2hoi.motion_representation import MotionRepresentation, MotionRepresentationConfig
-from models.text2hoi.sampler import MAX_BATCH_SIZE, Text2Hoi, Text2HoiMotion, bucket_by_length
-from models.text2hoi.verb_check import VerbCheck
+from models.text2hoi.family import OtherPrompt, other_prompts
+from models.text2hoi.sampler import MAX_BATCH_SIZE, Text2Hoi, bucket_by_length
 from tests.models.toy import FAST
 
 HANDS = load_embedded_hands()
+WRIST_X = torch.eye(99)[0]
 
 
 def samples_of(annotated: AnnotatedStore, split: str) -> list[ClipSample]:
@@ -184,63 +185,41 @@ def test_a_motion_does_not_depend_on_the_batch_and_depends_on_its_seed(sources: 
     assert abs(joints_of(together[0]) - joints_of(together[1])).max() > 1e-3
 
 
-def test_a_motion_depends_on_the_sentence_and_on_refinement(sources: Sources) -> None:
+def test_a_motion_depends_on_the_sentence_its_verb_and_refinement(
+    sources: Sources, monkeypatch: pytest.MonkeyPatch
+) -> None:
     model = load_family("text2hoi").load(sources)
     assert isinstance(model, Text2Hoi)
     sample = samples_of(sources.annotated, "test")[0]
     request = requests_for(sample, PredictionConfig(samples=1))[0]
-    other = replace(request, sentence=None, text=np.roll(request.text, 7))
-    assert abs(joints_of(model.sample([request])[0]) - joints_of(model.sample([other])[0])).max() > 1e-5
-    hands = torch.from_numpy(sample.hands)
-    before, after = hands.clone(), hands.clone()
-    after[..., 0] += 0.5
-    motion = Text2HoiMotion(before, after, torch.from_numpy(sample.object), torch.zeros(1024))
+    (plain,) = model.sample([request])
+    other_text = replace(request, text=np.roll(request.text, 7))
+    assert abs(joints_of(plain) - joints_of(model.sample([other_text])[0])).max() > 1e-5
+    other_verb = replace(request, sentence=Sentence("Open a box with the left hand.", None, None))
+    assert abs(joints_of(plain) - joints_of(model.sample([other_verb])[0])).max() > 1e-5
+    # The verb is read from the words, not from the annotation.
+    other_annotation = replace(request, sentence=Sentence(sample.sentences[0], "open", None))
+    np.testing.assert_array_equal(joints_of(plain), joints_of(model.sample([other_annotation])[0]))
+    monkeypatch.setattr(Text2Hoi, "refine", lambda self, batch, hands, *inputs: hands + 0.5 * WRIST_X)
+    (moved,), (coarse,) = model.sample([request]), load_family("text2hoi-coarse").load(sources).sample([request])
     shift = sample.world_from_model[:3, :3] @ [0.5, 0, 0]
-    coarse, refined = (model.clips([request], [motion], refined=kind)[0] for kind in (False, True))
     np.testing.assert_allclose(
-        joints_of(refined) - joints_of(coarse), np.broadcast_to(shift, joints_of(coarse).shape), atol=1e-5
+        joints_of(moved) - joints_of(coarse), np.broadcast_to(shift, joints_of(coarse).shape), atol=1e-5
     )
-    (motion,) = model.motions([request])
-    assert (motion.refined != motion.coarse).any()
-    answered = [*model.sample([request]), *model.clips([request], [motion], refined=True)]
-    np.testing.assert_array_equal(*map(joints_of, answered))
-    plain = load_family("text2hoi-coarse").load(sources).sample([request])[0]
-    unrefined = model.clips([request], model.motions([request], refined=False), refined=False)[0]
-    np.testing.assert_array_equal(joints_of(plain), joints_of(unrefined))
 
 
-def test_sampling_in_16_bits_moves_hands_by_less_than_a_millimetre_float16_less_than_bfloat16(sources: Sources) -> None:
-    requests = [requests_for(item, PredictionConfig(samples=1))[0] for item in samples_of(sources.annotated, "test")]
-    hands = {}
-    for precision in ("float32", "bfloat16", "float16"):
-        settings = {"text2hoi": {**FAST["text2hoi"], "precision": precision}}
-        model = load_family("text2hoi").load(replace(sources, settings=settings))
-        assert isinstance(model, Text2Hoi)
-        hands[precision] = torch.cat(
-            [item.coarse[..., :3].flatten() for item in model.motions(requests, refined=False)]
-        )
-    moved = {name: float((item - hands["float32"]).abs().max()) for name, item in hands.items()}
-    assert 0 < moved["float16"] < moved["bfloat16"] < 1e-3
-
-
-def test_contact_refinement_replaces_the_refiner_by_setting_or_in_the_object_frame(
-    sources: Sources, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_contact_refinement_replaces_the_refiner_by_setting(sources: Sources) -> None:
     request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
-    usual = load_family("text2hoi").load(sources)
-    settings = {"text2hoi": {**FAST["text2hoi"], "refined_by": "contact_refinement"}}
-    model = load_family("text2hoi").load(replace(sources, settings=settings))
-    assert isinstance(model, Text2Hoi)
-    assert isinstance(usual, Text2Hoi)
-    assert (usual.refined_by, model.refined_by) == ("network", "contact_refinement")
-    (motion,) = model.motions([request])
-    assert torch.equal(motion.refined, motion.coarse)
-    (before,), (refined,) = (model.clips([request], [motion], refined=kind) for kind in (False, True))
-    for side, track in refined_tracks(HANDS, before).items():
+    (coarse,), (refined,), (usual,) = (
+        load_family(name).load(sources).sample([request])
+        for name in ("text2hoi-coarse", "text2hoi-contact", "text2hoi")
+    )
+    for side, track in refine_grasps(HANDS, coarse).hands.items():
         np.testing.assert_array_equal(refined.hands[side].hand_pose, track.hand_pose)
-    in_object = MotionRepresentation(MotionRepresentationConfig(4, hand_frame="object"))
-    monkeypatch.setattr(usual.trained["diffusion"].network, "representation", in_object)
-    assert usual.refined_by == "contact_refinement"
+    assert abs(joints_of(usual) - joints_of(coarse)).max() > 1e-6
+    settings = {"text2hoi": {**FAST["text2hoi"], "refine": "contact"}}
+    (chosen,) = load_family("text2hoi").load(replace(sources, settings=settings)).sample([request])
+    np.testing.assert_array_equal(joints_of(chosen), joints_of(refined))
 
 
 def test_requests_are_batched_by_hands_and_length(sources: Sources) -> None:
@@ -261,50 +240,48 @@ def test_requests_are_batched_by_hands_and_length(sources: Sources) -> None:
 
 
 @pytest.mark.parametrize(
-    ("shares", "others", "taken", "draws"),
+    ("ranks", "taken", "attempts"),
     [
-        ((1.0,), "n", 0, 1), ((0.0, 0.75), "nn", 1, 2), ((0.25, 0.0, 0.0), "nnn", 0, 3),
-        ((0.0, 0.25, 0.0), "nnn", 1, 3), ((1.0, 0.9), "yn", 1, 2), ((0.9, 0.1, 1.0), "yny", 2, 3),
-        ((0.0, 0.6, 0.1), "yyy", 1, 3), ((1.0, 0.9), "un", 1, 2), ((0.9, 1.0, 0.8), "uyu", 0, 3),
-        ((0.9, 0.1, 1.0), "unu", 2, 3), ((0.9, 0.1, 1.0), "bnb", 2, 3),
-        ((0.9, 0.8, 1.0), "vuv", 1, 3), ((0.1, 1.0, 0.8), "nvu", 2, 3),
+        ([(2, 0.0, 1.0)], 0, 1),
+        ([(1, 0.0, 0.0), (2, 0.0, 0.75)], 1, 2),
+        ([(1, 0.0, 0.25), (1, 0.0, 0.0), (1, 0.0, 0.0)], 0, 3),
+        ([(1, 0.0, 0.0), (1, 0.0, 0.25), (1, 0.0, 0.0)], 1, 3),
+        ([(2, -1.0, 0.9), (2, -0.5, 0.8), (2, -1.0, 1.0)], 1, 3),
+        ([(0, 0.0, 0.0), (2, -3.0, 0.6), (1, 0.0, 0.9)], 1, 3),
     ],
-    ids=["carries", "the second carries", "none carries more", "the second carries more", "the second does as told",
-         "none does both, the third carries most", "all do as another verb says", "the second is as usual",
-         "all are unusual or of another verb", "none is usual and carries",
-         "another verb is unusual, too, and counts once", "the second is less unusual", "the third is"],
-)  # fmt: skip
-def test_motions_that_cannot_carry_or_show_another_verb_are_resampled(
-    sources: Sources, monkeypatch: pytest.MonkeyPatch, shares: tuple[float, ...], others: str, taken: int, draws: int
+    ids=["accepted", "the second", "all equal", "carries more", "less unusual", "meets more criteria"],
+)
+def test_rejected_motions_are_resampled_and_the_best_is_the_answer(
+    sources: Sources,
+    monkeypatch: pytest.MonkeyPatch,
+    ranks: list[tuple[int, float, float]],
+    taken: int,
+    attempts: int,
 ) -> None:
     request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
-    settings = {"text2hoi": {**FAST["text2hoi"], "refined_by": "contact_refinement", "max_attempts": 3}}
+    settings = {"text2hoi": {**FAST["text2hoi"], "attempts": 3}}
     model = load_family("text2hoi").load(replace(sources, settings=settings))
     assert isinstance(model, Text2Hoi)
-    sampled, left, verbs = list[Clip](), list(shares), list(others)
+    sampled, left = list[Clip](), list(ranks)
 
-    def carried_fraction(pair: HandPair, clip: Clip, settings: GraspSettings) -> float:
+    def rank(self: VerbRanges, verb: str | None, clip: Clip, points: object) -> tuple[int, float, float]:
+        assert verb == request.sentence.verb
         sampled.append(clip)
         return left.pop(0)
 
-    monkeypatch.setattr("models.text2hoi.sampler.carried_fraction", carried_fraction)
-    monkeypatch.setattr(VerbCheck, "moved_as", lambda self, numbers: verbs.pop(0))
-    beyond = iter([{"u": 0.5, "b": 1.0, "v": 2.0}.get(nearest_verb, 0.0) for nearest_verb in others])
-    monkeypatch.setattr(VerbCheck, "beyond", lambda self, verb, numbers: next(beyond))
-    monkeypatch.setattr(VerbCheck, "fails", lambda self, request, moved_as: moved_as in "yb")
+    monkeypatch.setattr(VerbRanges, "rank", rank)
     (answer,) = model.answers([request])
-    assert (answer.attempts, len(sampled), left) == (draws, draws, [])
-    assert (answer.carried, answer.clip, answer.moved_as) == (shares[taken], sampled[taken], others[taken])
+    assert (answer.attempts, len(sampled), left) == (attempts, attempts, [])
+    assert (answer.rank, answer.clip) == (ranks[taken], sampled[taken])
     for one, other in pairwise(sampled):
         assert abs(joints_of(one) - joints_of(other)).max() > 1e-3
 
 
-def test_only_contact_refinement_checks_carrying_and_verb(sources: Sources, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_attempt_is_not_ranked(sources: Sources, monkeypatch: pytest.MonkeyPatch) -> None:
     request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
     model = load_family("text2hoi").load(sources)
     assert isinstance(model, Text2Hoi)
-    monkeypatch.setattr("models.text2hoi.sampler.carried_fraction", None)
-    monkeypatch.setattr("models.text2hoi.sampler.VerbCheck", None)
+    monkeypatch.setattr(VerbRanges, "rank", None)
     assert [answer.attempts for answer in model.answers([request])] == [1]
 
 
@@ -339,7 +316,7 @@ def test_families_report_the_sampled_contact_map(
     requests = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=2))
     model = load_family("text2hoi").load(sources)
     assert isinstance(model, Text2Hoi)
-    sampled_maps = [motion.contact_map.numpy() == 1 for motion in model.motions(requests, refined=False)]
+    sampled_maps = [answer.touched.numpy() for answer in model.answers(requests)]
     for family in ("text2hoi", "text2hoi-coarse"):
         sampler = load_family(family).load(sources)
         assert isinstance(sampler, ReportsContact)

@@ -9,9 +9,8 @@ from hoidata.actions.action import learn_actions
 from hoidata.batches.requests import ObjectPoints
 from hoidata.clips.clip import SIDES, Clip, HandTrack
 from hoidata.hands import load_embedded_hands, track_vertices
+from hoidata.metrics.verb_ranges import VerbRanges, visible_faults
 from hoidata.objects.sampling import sample_points
-from models.text2hoi.generation import visible_faults
-from models.text2hoi.verb_check import VerbCheck
 from tests.builders.clips import DOWN, clip_of, flat_hand, still_object
 from tests.builders.objects import box_model
 
@@ -43,52 +42,56 @@ def points() -> ObjectPoints:
 
 
 @pytest.fixture(scope="module")
-def check(points: ObjectPoints) -> VerbCheck:
+def ranges(points: ObjectPoints) -> VerbRanges:
     """Of lifts, usually by 19 to 21 cm, and of objects that nobody moved."""
-    nothing = VerbCheck(learn_actions({}), 0.02, HANDS)
+    nothing = VerbRanges(learn_actions({}), 0.02, HANDS)
     clips = {
         "lift": [lift(rise_m=fraction * RISE) for fraction in (0.95, 1.0, 1.05)],
         "touch": [lift(rise_m=0 * RISE)] * 3,
     }
     numbers = {verb: [nothing.numbers(clip, points) for clip in verb_clips] for verb, verb_clips in clips.items()}
     usual = {"lift": {"rise_m": (0.19, 0.21), "path_m": (0.19, 0.21)}}
-    return VerbCheck(replace(learn_actions(numbers), usual=usual), 0.02, HANDS, 1.0)
+    return VerbRanges(replace(learn_actions(numbers), usual=usual), 0.02, HANDS)
+
+
+def faults_of(clip: Clip, points: ObjectPoints, ranges: VerbRanges | None, verb: str | None) -> tuple[str, ...]:
+    return visible_faults(clip, HANDS, ranges, verb, ranges.numbers(clip, points) if ranges else {})
 
 
 @pytest.mark.parametrize("fraction", [0.7, 0.95, 1.0, 1.3])
-def test_a_usual_lift_has_no_fault(fraction: float, points: ObjectPoints, check: VerbCheck) -> None:
+def test_a_usual_lift_has_no_fault(fraction: float, points: ObjectPoints, ranges: VerbRanges) -> None:
     clip = lift(rise_m=fraction * RISE)
-    assert visible_faults(clip, points, HANDS, check, "lift") == ()
-    unusual = check.unusual("lift", check.numbers(clip, points))
+    assert faults_of(clip, points, ranges, "lift") == ()
+    unusual = ranges.actions.unusual("lift", ranges.numbers(clip, points))
     assert bool(unusual) == (fraction in (0.7, 1.3))  # which the page has in numbers
 
 
 @pytest.mark.parametrize("fraction", [0.3, 2.0])
 def test_a_visibly_different_lift_is_reported_with_its_numbers(
-    fraction: float, points: ObjectPoints, check: VerbCheck
+    fraction: float, points: ObjectPoints, ranges: VerbRanges
 ) -> None:
-    (fault,) = visible_faults(lift(rise_m=fraction * RISE), points, HANDS, check, "lift")
+    (fault,) = faults_of(lift(rise_m=fraction * RISE), points, ranges, "lift")
     assert fault.startswith("unlike 'lift' in training")
     assert f"highest rise {20 * fraction:.3g} cm (usual: " in fault
     assert (", more like 'touch': " in fault) == (fraction == 0.3)
 
 
-def test_a_static_object_is_a_fault_if_the_verb_moves_it(points: ObjectPoints, check: VerbCheck) -> None:
+def test_a_static_object_is_a_fault_if_the_verb_moves_it(points: ObjectPoints, ranges: VerbRanges) -> None:
     still = lift(rise_m=0 * RISE)
-    assert visible_faults(still, points, HANDS, check, "lift") == ("the object does not move",)
-    assert visible_faults(still, points, HANDS, check, "touch") == ()
-    assert visible_faults(still, points, HANDS, None, None) == ()
+    assert faults_of(still, points, ranges, "lift") == ("the object does not move",)
+    assert faults_of(still, points, ranges, "touch") == ()
+    assert faults_of(still, points, None, None) == ()
 
 
 @pytest.mark.parametrize("gap_m", [0.008, 0.012, 0.3])
 def test_a_hand_without_contact_is_reported_from_one_centimetre(gap_m: float, points: ObjectPoints) -> None:
-    said = visible_faults(lift(-gap_m), points, HANDS, None, None)
+    said = faults_of(lift(-gap_m), points, None, None)
     expected = (f"the right hand never touches the object ({gap_m * 100:.1f} cm away)",)
     assert said == (expected if gap_m > 0.01 else ())
 
 
 def test_penetration_by_the_thickness_of_a_finger_is_reported(points: ObjectPoints) -> None:
-    shallow, deep = (visible_faults(lift(depth), points, HANDS, None, None) for depth in (0.015, 0.025))
+    shallow, deep = (faults_of(lift(depth), points, None, None) for depth in (0.015, 0.025))
     assert shallow == ()
     assert deep == (f"the right hand is up to 2.5 cm inside the object in {FRAMES} frames",)
 
@@ -97,9 +100,9 @@ def test_a_floating_object_is_reported(points: ObjectPoints) -> None:
     """The hand lies on the box first, then rises faster than it does."""
     floats = int((RISE > 0.02).sum())
     expected = f"the object is in the air and no hand touches it in {floats} frames"
-    assert visible_faults(lift(hand_rise_m=3 * RISE), points, HANDS, None, None) == (expected,)
+    assert faults_of(lift(hand_rise_m=3 * RISE), points, None, None) == (expected,)
 
 
 def test_inactive_hands_are_not_checked(points: ObjectPoints) -> None:
     assert not any(lift().hands[side].valid.any() for side in SIDES[:1])
-    assert visible_faults(lift(), points, HANDS, None, None) == ()
+    assert faults_of(lift(), points, None, None) == ()

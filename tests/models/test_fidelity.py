@@ -1,4 +1,4 @@
-"""The preset ``paper`` is Text2HOI as published: its tables, and its equations computed independently in NumPy."""
+"""The preset ``paper`` has Text2HOI's tables and equations; the equations are computed independently in NumPy."""
 
 from dataclasses import asdict, replace
 from typing import Any
@@ -17,11 +17,11 @@ from models.common.corpus import Corpus
 from models.common.features import Hands, Normaliser, place_points
 from models.common.sampling import add_noise, alphas_cumprod
 from models.common.training import TrainingSpec
-from models.common.transformer import TransformerConfig
+from models.common.transformer import TransformerConfig, sinusoid
 from models.registry import load_network
 from models.text2hoi.contact import ContactModel, contact_loss
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
-from models.text2hoi.diffusion_training import DiffusionLossConfig, DiffusionObjective, feature_weights
+from models.text2hoi.diffusion_training import DiffusionLossConfig, DiffusionObjective
 from models.text2hoi.length import LengthModel, length_error
 from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, Surface, attention_map
 from models.text2hoi.refiner_training import RefinerObjective
@@ -93,7 +93,7 @@ def test_the_denoiser_is_that_of_tables_s7_to_s9() -> None:
     assert heads == TABLES["S9"]
     inputs = [network.hands_in, network.object_in, network.step_in, network.text_in, network.object_condition_in]
     assert [size for part in inputs for size in linear(part)] == TABLES["S7"]
-    assert network.extent_in is network.to_go_in is network.points_in is None
+    assert network.verb_in is network.to_go_in is network.points_in is None
 
 
 def test_the_refiner_is_that_of_table_s10() -> None:
@@ -202,15 +202,44 @@ def equation_7(batch: ClipBatch, hands: np.ndarray, objects: np.ndarray) -> floa
     return float((difference**2).sum((-1, -2))[selected][batch.present.numpy()[selected]].mean())
 
 
+def scales_m(batch: ClipBatch) -> np.ndarray:
+    """(B,) s_obj of Sec. 3.1: from the mean of all vertices of the mesh, the distance of the farthest one."""
+    vertices = [model.vertices_m for model in batch.objects]
+    return np.array([max(np.linalg.norm(one - np.mean(v, 0)) for one in v) for v in vertices])
+
+
+def test_point_clouds_are_divided_by_the_scale_of_the_mesh_and_not_moved(batch: ClipBatch) -> None:
+    batch = replace(batch, points_m=batch.points_m + 0.05)  # of a mesh whose origin is not its centre
+    points, scale = spec("contact").network.point_net.normalised(batch.points_m, batch.scale_m)
+    expected = batch.points_m.numpy() / scales_m(batch)[:, None, None]
+    np.testing.assert_allclose(points.numpy(), expected, rtol=1e-5)
+    np.testing.assert_allclose(scale[:, 0].numpy(), scales_m(batch), rtol=1e-5)
+    both, read = module("contact").eval(), list[Tensor]()
+    assert isinstance(both, ContactModel)
+    for net in (both.object_net, both.contact_net):
+        net.register_forward_pre_hook(lambda _, inputs: read.append(inputs[0][..., :3]))
+    both(batch.points_m, batch.scale_m, batch.text[:, 0], batch.contact_map, torch.zeros(len(batch), 64))
+    denoiser = module("diffusion")
+    assert isinstance(denoiser, DiffusionModel)
+    denoiser.object_net.register_forward_pre_hook(lambda _, inputs: read.append(inputs[0]))
+    denoiser.encode_condition(Condition(batch, batch.text[:, 0], [None] * len(batch), batch.contact))
+    assert len(read) == 3
+    assert all(torch.equal(cloud, points) for cloud in read)
+
+
 def test_the_condition_follows_equations_2_and_3(batch: ClipBatch) -> None:
     """t_emb + f_text(CLIP) + f_obj({F_obj, contact map, scale}), with Table S7's layers."""
     torch.manual_seed(0)
     network = DiffusionModel(DiffusionConfig(transformer=TransformerConfig(layers=1))).eval()
-    feature = torch.randn(len(batch), 1024)
-    condition = Condition.of(batch, feature, batch.text[:, 0], batch.contact)
+    contact = torch.rand(batch.contact.shape) * batch.active_hands[..., None]
+    condition = Condition(batch, batch.text[:, 0], [None] * len(batch), contact)
+    clouds = batch.points_m / torch.from_numpy(scales_m(batch)).float()[:, None, None]
     steps = torch.tensor([3, 500, 999])
     with torch.no_grad():
-        token = network._condition(network._time(steps), network.encode_condition(condition), None)[0][:, 0].numpy()
+        assert network.object_net is not None
+        feature = network.object_net(clouds)[0]
+        time = network.step_in(sinusoid(steps, 512))
+        token = (network.encode_condition(condition).token[:, 0] + time).numpy()
     weights = {name: value.detach().numpy() for name, value in network.named_parameters()}
 
     def layer(name: str, x: np.ndarray) -> np.ndarray:
@@ -219,9 +248,7 @@ def test_the_condition_follows_equations_2_and_3(batch: ClipBatch) -> None:
     angles = steps.numpy()[:, None] * 10_000.0 ** (-np.arange(256) / 256)
     hidden = layer("step_in.0", np.concatenate((np.sin(angles), np.cos(angles)), -1))
     time = layer("step_in.2", hidden / (1 + np.exp(-hidden)))
-    points = batch.points_m.double().numpy()
-    scale = np.linalg.norm(points - points.mean(1, keepdims=True), axis=-1).max(1, keepdims=True)
-    body = np.concatenate((feature.numpy(), batch.contact_map.numpy(), scale), -1)
+    body = np.concatenate((feature.numpy(), contact.amax(1).numpy(), scales_m(batch)[:, None]), -1)
     expected = time + layer("text_in", batch.text[:, 0].double().numpy()) + layer("object_condition_in", body)
     np.testing.assert_allclose(token, expected, atol=1e-5, rtol=1e-5)
 
@@ -272,10 +299,16 @@ def refiner_objective(network: RefinerModel, annotated: AnnotatedStore) -> Refin
     generator = Exact(
         DiffusionModel(DiffusionConfig(transformer=TransformerConfig(16, 1, 2, 16))), Normaliser.identity()
     )
-    surface = Surface.of(hands, [clip.object_model for clip in (*corpus.train, *corpus.held_out)], 24, CPU)
-    loss = replace(spec("refiner").loss, samples=1)
+    surface = Surface.of(hands, [clip.object_model for clip in (*corpus.train, *corpus.held_out)], CPU)
     return RefinerObjective(
-        network, weights=loss, corpus=corpus, generator=generator, surface=surface, device=CPU, seed=0
+        network,
+        weights=spec("refiner").loss,
+        corpus=corpus,
+        generator=generator,
+        surface=surface,
+        device=CPU,
+        seed=0,
+        sample_contact=lambda batch, text, random: batch.contact.float(),
     )
 
 
@@ -291,7 +324,7 @@ def test_the_refiners_losses_follow_equations_8_and_9(annotated: AnnotatedStore)
 
 
 def test_the_refiner_reads_the_2273_numbers_of_section_12(batch: ClipBatch) -> None:
-    surface = Surface.of(Hands(load_embedded_hands()), batch.objects, 24, CPU)
+    surface = Surface.of(Hands(load_embedded_hands()), batch.objects, CPU)
     coarse = surface.coarse(batch, batch.hands, batch.object, batch.contact_map, batch.present)
     config = RefinerConfig(transformer=TransformerConfig(16, 1, 2, 16))
     inputs = RefinerModel(config)._inputs(coarse, coarse.hands).double().numpy()
@@ -347,6 +380,6 @@ def test_initial_gradients_of_equations_6_and_7_are_no_larger_than_of_5(
 
 
 def test_weights_of_feature_groups_sum_to_one() -> None:
-    for weighting, total in (("sum", (99, 10)), ("equal_groups", (1, 1))):
-        sums = [float(weights.sum()) for weights in feature_weights(weighting, CPU)]
+    for by_group, total in ((False, (99, 10)), (True, (1, 1))):
+        sums = [float(weights.sum()) for weights in losses.feature_weights(by_group, CPU)]
         assert sums == pytest.approx(total)

@@ -19,7 +19,7 @@ from hoidata.store.annotated import load_annotated
 from models.common.corpus import Corpus
 from models.common.family import Network, Objective, Setup
 from models.common.features import Hands
-from models.common.sampling import Motion, SamplerConfig, draw_motion
+from models.common.sampling import Motion, SamplerConfig
 from models.common.training import TrainingConfig, TrainingSpec, fit
 from models.registry import load_network
 from models.text2hoi.contact_training import best_threshold, contact_probabilities, true_maps
@@ -135,9 +135,10 @@ def test_contact_and_length_networks_overfit_two_clips(learnt: Learnt) -> None:
         min(f1_score(probability >= threshold, true) for probability, true in zip(probabilities, maps, strict=True))
         >= 0.95
     )
-    frames = networks["length"].expected_frames(batch.text[:, 0], batch.active_hands)  # pyright: ignore[reportCallIssue]
+    verbs = [clip.verb for clip in clips]
+    frames = networks["length"].expected_frames(batch.text[:, 0], verbs)  # pyright: ignore[reportCallIssue]
     torch.testing.assert_close(frames, batch.lengths.float(), atol=1.0, rtol=0)
-    swapped = networks["length"].expected_frames(batch.text.flip(0)[:, 0], batch.active_hands)  # pyright: ignore[reportCallIssue]
+    swapped = networks["length"].expected_frames(batch.text.flip(0)[:, 0], verbs[::-1])  # pyright: ignore[reportCallIssue]
     torch.testing.assert_close(swapped, frames.flip(0))
 
 
@@ -148,9 +149,7 @@ def test_the_diffusion_network_overfits_two_clips(learnt: Learnt) -> None:
         batch
     )
     steps, generator = torch.full((2,), 100), torch.Generator().manual_seed(0)
-    motion = learnt.generator.denoise_once(
-        targets.hands, targets.object, steps, condition(learnt, batch, batch.text), generator
-    )
+    motion = learnt.generator.denoise_once(targets.hands, targets.object, steps, condition(batch, [0, 1]), generator)
     assert joint_error_m(learnt, batch, *motion) < 0.005
 
 
@@ -159,11 +158,12 @@ def test_swapped_sentences_swap_the_paths_of_the_object(learnt: Learnt) -> None:
     batch = collate(learnt.clips)
     representation, generator = learnt.generator.network.representation, torch.Generator().manual_seed(0)
     sizes = representation.sizes(int(batch.lengths.max()))
-    noise = draw_motion((2, 2, sizes[0], 99), (2, sizes[1], representation.object_features), generator)
+    shapes = (2, 2, sizes[0], 99), (2, sizes[1], representation.object_features)
+    noise = torch.randn(shapes[0], generator=generator), torch.randn(shapes[1], generator=generator)
     for order, verbs in (([0, 1], [0, 1]), ([1, 0], [1, 0])):
         # The sentence and its length are swapped; the contact is not.
-        swapped = condition(learnt, batch, batch.text[order])
-        swapped = replace(swapped, lengths=batch.lengths[order], counts=tuple(batch.counts[index] for index in order))
+        counts = tuple(batch.counts[index] for index in order)
+        swapped = condition(replace(batch, lengths=batch.lengths[order], counts=counts), order)
         _, objects = learnt.generator.sample(swapped, SamplerConfig(), noise, generator)
         # The box is lifted along z or passed along x, by 20 cm.
         last = torch.stack([path[n - 1, :3] for path, n in zip(objects, batch.lengths[order], strict=True)])
@@ -213,9 +213,9 @@ def test_the_refiner_removes_four_fifths_of_added_noise(learnt: Learnt) -> None:
     network, clips = load_network("refiner"), learnt.clips
     spec = TrainingSpec.of(network, replace(DELIVERED, preset=learnt.preset).of("refiner"))
     # Eq. 9 only: contact and penetration also move fingers, and do not determine the wrist.
-    loss = replace(spec.loss, samples=1, penetration_weight=0.0, contact_weight=0.0, field_resolution=24)
+    loss = replace(spec.loss, penetration_weight=0.0, contact_weight=0.0)
     generator = Planted(learnt.generator.network, learnt.generator.normaliser)
-    surface = Surface.of(learnt.hands, [clips[0].object_model], 24, torch.device("cpu"))
+    surface = Surface.of(learnt.hands, [clips[0].object_model], torch.device("cpu"))
     torch.manual_seed(0)
     objective = Opposed(
         RefinerModel(spec.network),
@@ -225,19 +225,16 @@ def test_the_refiner_removes_four_fifths_of_added_noise(learnt: Learnt) -> None:
         surface=surface,
         device=torch.device("cpu"),
         seed=0,
+        sample_contact=lambda batch, text, random: batch.contact.float(),
     )
     objective.opposite = noisy(objective, replace(generator, sign=-1), clips)
     objective.pool = noisy(objective, generator, clips)
-    objective.weights = replace(loss, samples=len(objective.pool[clips[0].clip_id]))
     training = overfitting(spec.training, "refiner", learnt.preset)
     refiner = fit_quickly(objective, learnt.corpus, training)
     assert isinstance(refiner, RefinerModel)
     batch, random = collate(clips), torch.Generator().manual_seed(2)
     errors_m = np.mean(
-        [
-            wrists_off_m(refiner, objective._batch(batch, objective._coarse_motions(clips, "denoised", random)))
-            for _ in range(16)
-        ],
+        [wrists_off_m(refiner, objective._batch(batch, objective._coarse_motions(clips, random))) for _ in range(16)],
         axis=0,
     )
     assert errors_m[0] == pytest.approx(0.01, rel=0.03)  # 10 mm, and the error of the motion representation
@@ -247,7 +244,7 @@ def test_the_refiner_removes_four_fifths_of_added_noise(learnt: Learnt) -> None:
 def noisy(objective: RefinerObjective, generator: Planted, clips: list[ClipSample]) -> dict[str, list[_Coarse]]:
     """A thousand coarse motions per clip; a network would memorise the noise of 60."""
     objective.generator, random = generator, torch.Generator().manual_seed(1)
-    motions = [motion for _ in range(64) for motion in objective._coarse_motions(clips * 16, "denoised", random)]
+    motions = [motion for _ in range(64) for motion in objective._coarse_motions(clips * 16, random)]
     return {clip.clip_id: motions[index :: len(clips)] for index, clip in enumerate(clips)}
 
 
@@ -262,9 +259,10 @@ def wrists_off_m(refiner: RefinerModel, comparison: _Comparison) -> list[float]:
     return [float(distance[comparison.coarse.present].mean()) for distance in distances]
 
 
-def condition(learnt: Learnt, batch: ClipBatch, text: Tensor) -> Condition:
-    network = learnt.generator.network
-    return Condition.of(batch, network.object_feature(batch.points_m), text[:, 0], batch.contact)
+def condition(batch: ClipBatch, order: list[int]) -> Condition:
+    """The batch with the sentences in another order."""
+    verbs = [batch.samples[index].verb for index in order]
+    return Condition(batch, batch.text[order][:, 0], verbs, batch.contact)
 
 
 def joint_error_m(learnt: Learnt, batch: ClipBatch, hands: Tensor, objects: Tensor) -> float:

@@ -1,4 +1,4 @@
-"""The motion representation: splines, hands in the object's frame, relative rotations, whitening and rest."""
+"""The motion representation: splines, hands in the object's frame, relative rotations and whitening."""
 
 from dataclasses import replace
 
@@ -17,23 +17,25 @@ from models.common.features import (
     Normaliser,
     hands_in_object_frame,
     hands_in_world,
+    mean_start,
     proper_hands,
     recentred,
-)
-from models.common.spline import fit_spline, intervals_of, projected, snapped_to_rest, spline_basis, stacked_bases
-from models.text2hoi.motion_representation import (
-    MotionRepresentation,
-    MotionRepresentationConfig,
-    _still_hinge,
-    mean_start,
-    smooth_root,
     turned_from,
     turned_since_start,
+)
+from models.common.spline import (
+    fit_spline,
+    intervals_of,
+    projected,
+    smooth_root,
+    spline_basis,
+    stacked_bases,
     unwhiten,
     whiten,
 )
+from models.text2hoi.motion_representation import MotionRepresentation, MotionRepresentationConfig
 
-OURS = MotionRepresentationConfig(knot_frames=4, object_knots=2, hand_frame="object")
+OURS = MotionRepresentationConfig(knot_frames=4, hand_frame="object")
 ALL_CONFIGS = [
     MotionRepresentationConfig(),
     replace(MotionRepresentationConfig(), hand_frame="object"),
@@ -161,48 +163,12 @@ def test_the_two_frames_of_hands_are_each_others_inverse(batch: ClipBatch) -> No
     torch.testing.assert_close(in_world[batch.present], batch.hands[batch.present], atol=1e-5, rtol=0)
 
 
-def brought_to_rest(rows: Tensor, reach: float = 0.004) -> Tensor:
-    return snapped_to_rest(rows, torch.ones(len(rows), dtype=torch.bool), torch.full((rows.shape[1],), reach), around=4)
-
-
-def test_control_points_in_one_position_come_to_rest_and_a_path_is_kept() -> None:
-    path = torch.cat((torch.zeros(12), torch.linspace(0, 0.2, 6)[1:], torch.full((12,), 0.2)))[:, None].repeat(1, 3)
-    noise = 0.001 * torch.randn(path.shape, generator=torch.Generator().manual_seed(0))
-    result = brought_to_rest(path + noise)
-    speed = [float(rows[:8].diff(dim=0).norm(dim=-1).mean()) for rows in (path + noise, result)]
-    assert speed[1] < 0.2 * speed[0]
-    assert float((result - path).norm(dim=-1).max()) < 0.005
-    mask = torch.arange(len(path)) < 12
-    masked = snapped_to_rest(path + noise, mask, torch.full((3,), 0.004), around=4)
-    torch.testing.assert_close(masked[:12], brought_to_rest((path + noise)[:12]))
-
-
-@pytest.mark.parametrize("cm_s", [1, 2, 3, 4, 5, 6, 8, 12, 30])
-def test_slow_motion_does_not_become_steps(cm_s: float) -> None:
-    """Two seconds of motion, 15 control points per second. Comparing neighbours only, 5 cm/s would become 15 cm/s."""
-    step = cm_s / 1500
-    path = torch.cat((torch.zeros(15), torch.arange(1, 31) * step, torch.full((15,), 30 * step)))[:, None]
-    result = brought_to_rest(path)
-    speed = result.diff(dim=0)[20:40]
-    assert 0.65 * step < float(speed.min())
-    assert float(speed.max()) < 1.05 * step
-    assert float((result - path).abs().max()) < 0.004
-
-
-def test_a_shake_keeps_its_size() -> None:
-    """3.5 Hz, 3 cm from end to end, 15 control points per second."""
-    rows = 0.015 * torch.sin(2 * torch.pi * 3.5 / 15 * torch.arange(60))[:, None]
-    torch.testing.assert_close(brought_to_rest(rows)[2:-2], rows[2:-2], atol=1e-3, rtol=0)
-
-
 REPRESENTATION = MotionRepresentation(
     MotionRepresentationConfig(
         knot_frames=4,
-        object_knots=2,
         hand_frame="object",
         object_rotation="relative_to_start",
         whitening_frames=8,
-        rest_threshold_m=0.004,
     )
 )
 
@@ -297,11 +263,9 @@ def test_a_motion_is_the_same_in_a_batch_with_a_longer_one(batch: ClipBatch) -> 
     hands = torch.stack(
         [torch.cat((clip.hands, torch.full((2, longest[1] - clip.hands.shape[1], 99), 9.0)), 1) for clip in encoded]
     )
-    together = REPRESENTATION.features_per_frame(*REPRESENTATION.snapped_to_rest(hands, objects, counts), counts)
+    together = REPRESENTATION.features_per_frame(hands, objects, counts)
     for index, (clip, count) in enumerate(zip(encoded, counts, strict=True)):
-        alone = REPRESENTATION.features_per_frame(
-            *REPRESENTATION.snapped_to_rest(clip.hands[None], clip.object[None], [count]), [count]
-        )
+        alone = REPRESENTATION.features_per_frame(clip.hands[None], clip.object[None], [count])
         torch.testing.assert_close(together[1][index, :count], alone[1][0], atol=1e-5, rtol=0)
 
 
@@ -312,82 +276,3 @@ def test_first_frame_rotations_have_one_scale(batch: ClipBatch) -> None:
     assert normaliser.object_scale.shape == (16,)
     expected = max(float(rows[:, 10:].double().var(0, correction=0).mean()) ** 0.5, 0.05)
     torch.testing.assert_close(normaliser.object_scale[10:], torch.full((6,), expected), atol=1e-5, rtol=0)
-
-
-def test_a_wobble_of_millimetres_comes_to_rest(batch: ClipBatch) -> None:
-    sample = batch.samples[0]
-    objects = np.repeat(sample.object[:1], sample.length, 0)
-    shaky = REPRESENTATION.encode(replace(sample, object=objects))
-    random = torch.Generator().manual_seed(0)
-    rows = shaky.object + 0.002 * torch.randn(shaky.object.shape, generator=random)
-    counts = [sample.length]
-    before = REPRESENTATION.features_per_frame(shaky.hands[None], rows[None], counts)[1][0, :, :3]
-    after = REPRESENTATION.features_per_frame(
-        *REPRESENTATION.snapped_to_rest(shaky.hands[None], rows[None], counts), counts
-    )[1][0, :, :3]
-    assert after.diff(dim=0).norm(dim=-1).max() < 0.5 * before.diff(dim=0).norm(dim=-1).max()
-
-
-def test_a_hinge_comes_to_rest_though_the_object_moves(batch: ClipBatch) -> None:
-    sample = next(clip for clip in batch.samples if clip.object[:, :3].std(0).max() > 0.01)
-    rows, counts = REPRESENTATION.encode(sample).object, [sample.length]
-    wobble = 0.005 * torch.randn(len(rows), generator=torch.Generator().manual_seed(0))
-    shaky = torch.cat((rows[:, :9], (rows[:, 9] + wobble)[:, None], rows[:, 10:]), 1)
-    hands = REPRESENTATION.encode(sample).hands[None]
-    before, after = (
-        REPRESENTATION.features_per_frame(*points, counts)[1][0]
-        for points in ((hands, shaky[None]), REPRESENTATION.snapped_to_rest(hands, shaky[None], counts))
-    )
-    assert after[:, 9].diff(dim=0).abs().max() < 0.2 * before[:, 9].diff(dim=0).abs().max()
-    assert float((after - before)[:, :3].norm(dim=-1).max()) < 0.004
-
-
-def test_an_object_that_is_pushed_slowly_keeps_its_path() -> None:
-    """Three seconds, 4 cm/s in the middle. Compared over fewer frames it would partly count as rest, 4 mm off."""
-    path_m = np.interp(np.arange(90), [20, 70], [0, 50 * 0.04 / 30])
-    still = np.zeros(90)
-    objects, _ = features(Rotation.identity(90), np.column_stack((path_m, still, still)), still)
-    knots = intervals_of(90, 4)
-    rows = REPRESENTATION._whitened(
-        fit_spline(turned_since_start(objects), torch.ones(90), knots * REPRESENTATION.config.object_knots)
-    )
-    hands = torch.zeros(1, 2, knots + 3, 99)
-    after = REPRESENTATION.features_per_frame(*REPRESENTATION.snapped_to_rest(hands, rows[None], [90]), [90])[1][
-        0, :, 0
-    ].numpy()
-    assert np.abs(after - path_m).max() < 0.0015
-    assert np.diff(after).max() < 1.5 * np.diff(path_m).max()
-
-
-def test_a_hinge_that_hardly_moves_is_fixed_and_one_that_opens_is_kept(batch: ClipBatch) -> None:
-    sample = batch.samples[0]
-    for range_rad, still in ((0.03, True), (0.4, False)):
-        objects = sample.object.copy()
-        objects[:, 9] = np.linspace(0.2, 0.2 + range_rad, len(objects))
-        encoded, counts = REPRESENTATION.encode(replace(sample, object=objects)), [sample.length]
-        angle = REPRESENTATION.features_per_frame(
-            *REPRESENTATION.snapped_to_rest(encoded.hands[None], encoded.object[None], counts), counts
-        )[1][0, :, 9]
-        assert float(angle.max() - angle.min()) == pytest.approx(0 if still else range_rad, abs=0.01 * range_rad + 1e-6)
-        assert float(angle.mean()) == pytest.approx(0.2 + range_rad / 2, abs=0.002)
-
-
-def test_padding_does_not_prevent_a_hinge_from_being_fixed() -> None:
-    mask = torch.tensor([[True, True, True, False]])
-    angle = _still_hinge(torch.tensor([[0.20, 0.22, 0.21, 9.0]]), mask)
-    torch.testing.assert_close(angle[0, :3], torch.full((3,), 0.21))
-
-
-def test_a_lid_that_opens_does_not_jitter_before_and_after() -> None:
-    """It rests, opens by half a radian in half a second, and rests; jitter of 0.004 rad is removed."""
-    angle, still = np.interp(np.arange(90), [38, 52], [0, 0.5]), np.zeros((90, 3))
-    objects, _ = features(Rotation.identity(90), still, angle)
-    knots = intervals_of(90, 4)
-    rows = fit_spline(turned_since_start(objects), torch.ones(90), knots * REPRESENTATION.config.object_knots)
-    rows[:, 9] += 0.004 * torch.randn(len(rows), generator=torch.Generator().manual_seed(0))
-    hands, rows = torch.zeros(1, 2, knots + 3, 99), REPRESENTATION._whitened(rows)[None]
-    before = REPRESENTATION.features_per_frame(hands, rows, [90])[1][0, :, 9]
-    after = REPRESENTATION.features_per_frame(*REPRESENTATION.snapped_to_rest(hands, rows, [90]), [90])[1][0, :, 9]
-    for rest in (slice(2, 26), slice(64, 88)):
-        assert after[rest].diff().abs().max() < 0.3 * before[rest].diff().abs().max()
-    assert float((after - torch.from_numpy(angle).float()).abs().max()) < 0.05

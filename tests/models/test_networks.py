@@ -25,8 +25,7 @@ from models.common.transformer import (
     packed,
     sinusoid,
 )
-from models.text2hoi.diffusion import SAME_OBJECT, Condition, DiffusionConfig, DiffusionModel
-from models.text2hoi.diffusion_training import DiffusionObjective
+from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
 from models.text2hoi.length import LengthConfig, LengthModel, length_loss
 from models.text2hoi.motion_representation import MotionRepresentationConfig
 from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, Surface
@@ -35,29 +34,28 @@ SMALL = TransformerConfig(
     width=32, layers=2, heads=2, feed_forward=64, dropout=0.0, norm_first=True, frames_per_token=2
 )
 POINT_NET = PointNetConfig(widths=(16, 32, 64), heads=(32, 16))
+VERBS = ("lift", "open", "pass")
 
 
 def diffusion_model(**changes) -> DiffusionModel:
     torch.manual_seed(0)
-    config = DiffusionConfig(
-        SMALL, POINT_NET, contact_input="tokens", frames_to_go=True, condition_on_hands_and_length=True
-    )
+    config = DiffusionConfig(SMALL, POINT_NET, contact_input="tokens", frames_to_go=True, verbs=VERBS)
     return DiffusionModel(replace(config, **changes)).eval()
 
 
-def condition_of(batch: ClipBatch, model: DiffusionModel) -> Condition:
-    return Condition.of(batch, model.object_feature(batch.points_m), batch.text[:, 0], batch.contact)
+def condition_of(batch: ClipBatch) -> Condition:
+    return Condition(batch, batch.text[:, 0], [sample.verb for sample in batch.samples], batch.contact)
 
 
 def coarse_of(batch: ClipBatch) -> CoarseMotion:
-    surface = Surface.of(Hands(load_embedded_hands()), batch.objects, 24, torch.device("cpu"))
+    surface = Surface.of(Hands(load_embedded_hands()), batch.objects, torch.device("cpu"))
     return surface.coarse(batch, batch.hands, batch.object, batch.contact_map, batch.present)
 
 
 SETTINGS = {
     "paper": {},
     "tokens of frames": {"transformer": replace(SMALL, frames_per_token=5)},
-    "splines": {"motion": MotionRepresentationConfig(knot_frames=4, object_knots=2)},
+    "splines": {"motion": MotionRepresentationConfig(knot_frames=4)},
     "object frame": {"motion": MotionRepresentationConfig(hand_frame="object")},
     "box centre as position": {
         "motion": MotionRepresentationConfig(hand_frame="object", object_reference_point="box_centre")
@@ -65,14 +63,10 @@ SETTINGS = {
     "rotation since the start": {"motion": MotionRepresentationConfig(object_rotation="relative_to_start")},
     "whitened": {"motion": MotionRepresentationConfig(knot_frames=4, whitening_frames=8)},
     "contact tokens": {"contact_input": "tokens"},
-    "verbs": {"text_input": "verb_probabilities", "verb_count": 5},
-    "condition in every token": {"condition_every_token": True},
+    "verbs": {"verbs": VERBS},
     "frames to go": {"frames_to_go": True},
     "signal scale": {"signal_scale": 0.2},
-    "without the object's size": {"scale_input": False},
-    "gate": {"input_gate": True},
     "adaptive norm": {"transformer": replace(SMALL, adaptive_norm=True)},
-    "hands and length": {"condition_on_hands_and_length": True},
 }
 
 
@@ -86,7 +80,7 @@ def points_of(batch: ClipBatch, model: DiffusionModel) -> tuple[Tensor, Tensor]:
 def test_padding_and_absent_hands_change_no_output(batch: ClipBatch, setting: str) -> None:
     torch.manual_seed(0)
     model = DiffusionModel(replace(DiffusionConfig(SMALL, POINT_NET), **SETTINGS[setting])).eval()
-    condition, steps = condition_of(batch, model), torch.tensor([10, 500, 900])
+    condition, steps = condition_of(batch), torch.tensor([10, 500, 900])
     hands, objects = points_of(batch, model)
     hand_mask, object_mask = model.representation.valid_masks(batch.counts, torch.device("cpu"))
     with torch.no_grad():
@@ -94,7 +88,7 @@ def test_padding_and_absent_hands_change_no_output(batch: ClipBatch, setting: st
         hands[~batch.active_hands] = 100.0
         hands.transpose(1, 2)[~hand_mask] = -50.0
         objects[~object_mask] = 50.0
-        idle = condition.contact | ~condition.active_hands[..., None]
+        idle = condition.contact | ~batch.active_hands[..., None]
         after = model(hands, objects, steps, replace(condition, contact=idle))
     present = hand_mask[:, None] & batch.active_hands[..., None]
     assert torch.equal(before[0][present], after[0][present])
@@ -111,16 +105,12 @@ def test_each_setting_changes_only_its_part_of_the_weights() -> None:
         "object frame": set(),
         "box centre as position": set(),
         "rotation since the start": {"object_in", "object_out"},
-        "whitened": set(),
-        "contact tokens": {"object_condition_in", "points_in"},
-        "verbs": {"text_in"},
-        "condition in every token": set(),
+        "whitened": {"object_in", "object_out"},  # by its splines
+        "contact tokens": {"object_net", "object_condition_in", "points_in"},
+        "verbs": {"verb_in"},
         "frames to go": {"to_go_in"},
         "signal scale": set(),
-        "without the object's size": {"object_condition_in"},
-        "gate": {"gate_in"},
         "adaptive norm": {"encoder"},
-        "hands and length": {"extent_in"},
     }
     for setting, changes in SETTINGS.items():
         changed_shapes = shapes(replace(DiffusionConfig(SMALL, POINT_NET), **changes))
@@ -178,89 +168,6 @@ def test_adaptive_norm_without_a_condition_is_refused() -> None:
         RefinerModel(RefinerConfig(transformer=replace(SMALL, adaptive_norm=True)))
 
 
-def test_the_input_gate_depends_on_the_timestep(batch: ClipBatch) -> None:
-    """Closed at every timestep, noised input changes nothing; open, it does."""
-    model = diffusion_model(input_gate=True)
-    condition, steps = condition_of(batch, model), torch.tensor([10, 500, 900])
-    hands, objects = points_of(batch, model)
-    assert model.gate_in is not None
-    nn.init.zeros_(model.gate_in.weight)
-    differences = []
-    for open_by in (0.0, -1.0):
-        nn.init.constant_(model.gate_in.bias, open_by)
-        with torch.no_grad():
-            pair = [model(hands, moved, steps, condition)[1] for moved in (objects, objects + 1)]
-        differences.append(float((pair[0] - pair[1]).abs().max()))
-    assert differences[0] > 1e-3
-    assert differences[1] == 0
-
-
-def test_the_motion_depends_on_the_objects_condition(batch: ClipBatch) -> None:
-    model = diffusion_model()
-    hands, objects = points_of(batch, model)
-    steps, condition = torch.tensor([10, 500, 900]), condition_of(batch, model)
-
-    def moved_by(other: Condition) -> float:
-        with torch.no_grad():
-            return float(
-                (model(hands, objects, steps, condition)[1] - model(hands, objects, steps, other)[1]).abs().max()
-            )
-
-    assert moved_by(replace(condition, object=condition.object + 1)) > 1e-3
-    assert moved_by(replace(condition, points_m=condition.points_m + 0.05)) > 1e-4
-
-
-def test_only_training_objects_are_conditioned_on_their_feature(batch: ClipBatch) -> None:
-    """The feature of a new object could be mistaken for that of a training object."""
-    model = diffusion_model(object_dropout=0.5, object_count=1, scale_input=False, contact_input="tokens")
-    hands, objects = points_of(batch, model)
-    steps, original = torch.tensor([10, 500, 900]), condition_of(batch, model)
-
-    def answers(training_features: torch.Tensor, condition: Condition) -> torch.Tensor:
-        model.store_training_objects(training_features)
-        with torch.no_grad():
-            return model(hands, objects, steps, condition)[1]
-
-    first, shifted = original.object[:1], original.object[:1] + 1
-    same_object = (original.object - first).norm(dim=-1) < 1e-3 * first.norm()
-    moved = (answers(first, original) - answers(shifted, original)).abs().amax((1, 2))
-    assert (moved > 1e-4).equal(same_object)
-    scaled = replace(original, object=original.object * 3)
-    assert answers(shifted, scaled).equal(answers(shifted, original))
-
-
-def test_a_masked_object_feature_changes_nothing_and_contact_points_still_do(batch: ClipBatch) -> None:
-    model = diffusion_model(contact_input="tokens", scale_input=False)
-    hands, objects = points_of(batch, model)
-    steps, original = torch.tensor([10, 500, 900]), condition_of(batch, model)
-
-    def answers(condition: Condition, mask: list[float]) -> torch.Tensor:
-        with torch.no_grad():
-            return model(hands, objects, steps, condition, torch.tensor([mask]).expand(3, -1))[1]
-
-    other, without_contact = (
-        replace(original, object=original.object + 1),
-        replace(original, contact=torch.zeros_like(original.contact)),
-    )
-    assert answers(other, [1.0, 1.0, 0.0]).equal(answers(original, [1.0, 1.0, 0.0]))
-    assert not answers(other, [1.0, 1.0, 1.0]).equal(answers(original, [1.0, 1.0, 1.0]))
-    assert not answers(without_contact, [1.0, 1.0, 0.0]).equal(answers(original, [1.0, 1.0, 0.0]))
-
-
-@pytest.mark.parametrize(("dropout", "lowest", "highest"), [(0.0, 0.85, 0.95), (0.5, 0.4, 0.5), (1.0, 0.0, 0.0)])
-def test_object_dropout_masks_the_object_feature_in_a_fraction_of_the_steps(
-    annotated: AnnotatedStore, dropout: float, lowest: float, highest: float
-) -> None:
-    model = diffusion_model(object_dropout=dropout, condition_dropout=0.1, scale_input=False)
-    objective = DiffusionObjective.__new__(DiffusionObjective)
-    objective.network = model
-    mask = objective.sample_condition_mask(4000, torch.Generator().manual_seed(0)).float()
-    assert mask[:, 0].mean() == pytest.approx(0.9, abs=0.02)
-    assert mask[:, 1].mean() == pytest.approx(0.9, abs=0.02)
-    assert lowest <= mask[:, 2].mean() <= highest
-    assert not (mask[:, 2] > mask[:, 1]).any()  # without contact points there is no F_obj
-
-
 def test_position_codes_follow_the_transformer_paper() -> None:
     """Vaswani et al. 2017, Sec. 3.5, number by number; the agents' codes are distant positions of the same table."""
     codes, width = sinusoid(torch.tensor([0, 7, 1666]), 6), 6
@@ -312,38 +219,45 @@ def test_a_clip_gives_the_same_alone_and_padded_in_a_batch(annotated: AnnotatedS
     model = diffusion_model()
     alone = collate([batch.samples[0]])
     with torch.no_grad():
-        many = model(batch.hands, batch.object, torch.full((3,), 300), condition_of(batch, model))
-        one = model(alone.hands, alone.object, torch.full((1,), 300), condition_of(alone, model))
+        many = model(batch.hands, batch.object, torch.full((3,), 300), condition_of(batch))
+        one = model(alone.hands, alone.object, torch.full((1,), 300), condition_of(alone))
     length, side = batch.samples[0].length, int(batch.active_hands[0].float().argmax())
     torch.testing.assert_close(many[0][0, side, :length], one[0][0, side], atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(many[1][0, :length], one[1][0], atol=1e-5, rtol=1e-4)
 
 
-def test_text_contact_and_hand_flags_change_the_motion(batch: ClipBatch) -> None:
-    model, steps = diffusion_model(), torch.full((3,), 300)
-    condition = condition_of(batch, model)
+@pytest.mark.parametrize("contact_input", ["map", "tokens"])
+def test_text_verb_contact_hands_and_object_change_the_motion(
+    batch: ClipBatch, contact_input: Literal["map", "tokens"]
+) -> None:
+    model, steps = diffusion_model(contact_input=contact_input), torch.full((3,), 300)
+    condition = condition_of(batch)
     changes = {
-        "text": condition.text + 1,
-        "contact": ~condition.contact,
-        "active_hands": torch.ones_like(condition.active_hands),
+        "text": {"text": condition.text + 1},
+        "verb": {"verbs": ["pass", "open", "lift"]},
+        "contact": {"contact": ~condition.contact},
+        "hands": {"batch": replace(batch, active_hands=torch.ones_like(batch.active_hands))},
+        "object": {"batch": replace(batch, points_m=batch.points_m * torch.tensor([1.0, 0.5, 2.0]))},
     }
     with torch.no_grad():
         before = model(batch.hands, batch.object, steps, condition)[1]
-        for name, value in changes.items():
-            after = model(batch.hands, batch.object, steps, replace(condition, **{name: value}))[1]
+        for name, values in changes.items():
+            after = model(batch.hands, batch.object, steps, replace(condition, **values))[1]
             assert (before - after)[batch.frames].abs().max() > 1e-4, name
 
 
-def test_the_raw_contact_map_of_the_paper_is_an_option(batch: ClipBatch) -> None:
-    model = diffusion_model(contact_input="map", frames_to_go=False)
-    hands, objects = model(batch.hands, batch.object, torch.zeros(3, dtype=torch.long), condition_of(batch, model))
-    assert hands.shape == batch.hands.shape
-    assert objects.shape == batch.object.shape
+def test_a_verb_that_is_not_in_training_adds_nothing(batch: ClipBatch) -> None:
+    model, condition = diffusion_model(), condition_of(batch)
+    assert model.verb_in is not None
+    none, strange = (model.encode_condition(replace(condition, verbs=[verb] * 3)) for verb in (None, "juggle"))
+    assert torch.equal(none.token, strange.token)
+    lift = model.encode_condition(replace(condition, verbs=["lift"] * 3)).token
+    torch.testing.assert_close(lift - none.token, model.verb_in.weight[:, 0].expand(3, 1, -1))
 
 
 def test_a_refiner_starts_as_the_identity_and_every_parameter_learns(batch: ClipBatch) -> None:
     torch.manual_seed(0)
-    model = RefinerModel(RefinerConfig(SMALL, view="object", surface_input=True, output="residual"))
+    model = RefinerModel(RefinerConfig(SMALL, output="residual"))
     coarse = coarse_of(batch)
     torch.testing.assert_close(model(coarse)[batch.present], batch.hands[batch.present], atol=1e-5, rtol=0)
     optimiser = torch.optim.SGD(model.parameters(), lr=0.1)
@@ -356,12 +270,12 @@ def test_a_refiner_starts_as_the_identity_and_every_parameter_learns(batch: Clip
     assert without == []
 
 
-@pytest.mark.parametrize("view", ["world", "object"])
+@pytest.mark.parametrize("output", ["hands", "residual"])
 def test_refined_hands_do_not_depend_on_padding_or_absent_hands(
-    batch: ClipBatch, view: Literal["world", "object"]
+    batch: ClipBatch, output: Literal["hands", "residual"]
 ) -> None:
     torch.manual_seed(0)
-    model = RefinerModel(RefinerConfig(SMALL, view=view)).eval()
+    model = RefinerModel(RefinerConfig(SMALL, output=output)).eval()
     torch.nn.init.normal_(model.hands_out[0].weight, std=0.1)
     torch.nn.init.normal_(model.hands_out[1].weight, std=0.1)
     coarse = coarse_of(batch)
@@ -369,23 +283,6 @@ def test_refined_hands_do_not_depend_on_padding_or_absent_hands(
     other = replace(coarse, hands=torch.where(coarse.present[..., None], coarse.hands, noise))
     with torch.no_grad():
         assert torch.equal(model(coarse)[batch.present], model(other)[batch.present])
-
-
-def test_training_objects_are_recognised_within_a_hundredth() -> None:
-    """Distances by a matrix product, torch's default for more than 25 vectors, would be less accurate."""
-    model = diffusion_model(object_dropout=0.5, object_count=60, scale_input=False)
-    generator = torch.Generator().manual_seed(0)
-    features, directions = (torch.randn(60, POINT_NET.widths[-1], generator=generator) for _ in range(2))
-    model.store_training_objects(features)
-    step = directions / directions.norm(dim=-1, keepdim=True) * SAME_OBJECT * features.norm(dim=-1).mean()
-    assert bool((model._is_training_object(features + 0.9999 * step) == 1).all())
-    assert bool((model._is_training_object(features + 1.0001 * step) == 0).all())
-
-
-@pytest.mark.parametrize("other", [{"contact_input": "map"}, {"scale_input": True}])
-def test_object_dropout_with_other_object_inputs_is_refused(other: dict) -> None:
-    with pytest.raises(BadInput, match="object_dropout: 0"):
-        diffusion_model(**{"object_dropout": 0.5, "scale_input": False, **other})
 
 
 def noise_like(coarse: CoarseMotion, seed: int) -> Tensor:
@@ -415,18 +312,16 @@ def two_clips(batch: ClipBatch) -> ClipBatch:
 
 def test_the_length_model_overfits_two_clips_and_keeps_its_variance(batch: ClipBatch) -> None:
     torch.manual_seed(0)
-    two = two_clips(batch)
-    model = LengthModel(LengthConfig(width=64, sampled_from="gaussian", condition_on_hands_and_length=True))
-    lengths, inputs = torch.tensor([40, 120]), (two.text[:, 0], two.active_hands, torch.zeros(2, 1))
+    two, verbs = two_clips(batch), ["lift", "pass"]
+    model = LengthModel(LengthConfig(width=64, sampled_from="gaussian", verbs=VERBS))
+    lengths, inputs = torch.tensor([40, 120]), (two.text[:, 0], verbs, torch.zeros(2, 1))
     fitted(model.parameters(), lambda: length_loss(*model.moments(*inputs), lengths)["total"], rate=5e-3)
-    torch.testing.assert_close(
-        model.expected_frames(two.text[:, 0], two.active_hands), lengths.float(), atol=2.0, rtol=0
-    )
-    samples = model.sample(
-        two.text[:1, 0].expand(200, -1), two.active_hands[:1].expand(200, -1), torch.Generator().manual_seed(0)
-    )
+    torch.testing.assert_close(model.expected_frames(two.text[:, 0], verbs), lengths.float(), atol=2.0, rtol=0)
+    samples = model.sample(two.text[:1, 0].expand(200, -1), ["lift"] * 200, torch.Generator().manual_seed(0))
     assert samples.float().std() > 0.5
     assert samples.min() >= 8
+    other = model.expected_frames(two.text[:1, 0], ["pass"])
+    assert abs(float(other - model.expected_frames(two.text[:1, 0], ["lift"]))) > 1
 
 
 @pytest.mark.slow
@@ -436,7 +331,7 @@ def test_the_generator_overfits_two_clips(batch: ClipBatch) -> None:
     normaliser = Normaliser.of(list(zip(two.hands, two.object, two.present, strict=True)))
     hands, objects = normaliser.encode(two.hands, two.object)
     signal, generator = alphas_cumprod(), torch.Generator().manual_seed(0)
-    condition = condition_of(two, model)
+    condition = condition_of(two)
 
     def loss() -> Tensor:
         steps = torch.randint(1000, (2,), generator=generator)

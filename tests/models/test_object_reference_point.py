@@ -16,7 +16,6 @@ from hoidata.store.annotated import AnnotatedStore
 from models.common.augmentation import augment
 from models.common.corpus import Corpus
 from models.common.features import Hands, Normaliser, base_middle_m, placed_at
-from models.common.point_net import PointNetConfig
 from models.common.sampling import SamplerConfig
 from models.common.transformer import TransformerConfig
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
@@ -25,7 +24,6 @@ from models.text2hoi.motion_representation import MotionRepresentation, MotionRe
 
 BOX_CENTRE = MotionRepresentationConfig(
     knot_frames=4,
-    object_knots=2,
     hand_frame="object",
     object_reference_point="box_centre",
     object_rotation="relative_to_start",
@@ -115,7 +113,7 @@ def test_recorded_motions_have_no_loss_of_joints_and_distances(annotated: Annota
     """Recorded motions have zero loss, with shifted mesh origins and one control point per frame."""
     clips = [moved_origin(clip) for clip in HoiDataset(annotated, "train")]
     batch = collate(clips, FrameSelection.drawn([clip.length for clip in clips], 5, 2000, np.random.default_rng(0)))
-    motion = replace(BOX_CENTRE, knot_frames=0, object_knots=1, object_rotation="absolute")
+    motion = replace(BOX_CENTRE, knot_frames=0, object_rotation="absolute")
     network = DiffusionModel(DiffusionConfig(TransformerConfig(32, 1), motion=motion))
     loss = DiffusionLossConfig(joint_weight=1.0)
     objective = DiffusionObjective(
@@ -138,17 +136,14 @@ def test_a_generated_motion_does_not_depend_on_the_mesh_origin(batch: ClipBatch)
     """With the same noise, sentence, contact and network, hands and object points have the same positions."""
     torch.manual_seed(0)
     size = TransformerConfig(width=32, layers=1, heads=2, feed_forward=32)
-    inputs = {"contact_input": "tokens", "scale_input": False}
-    network = DiffusionModel(
-        DiffusionConfig(size, PointNetConfig((8, 8, 16), (8, 8), False), BOX_CENTRE, **inputs)
-    ).eval()
+    network = DiffusionModel(DiffusionConfig(size, motion=BOX_CENTRE, contact_input="tokens")).eval()
     generator = MotionGenerator(network, Normaliser.identity(network.representation.object_features).scaled_to(4.0))
     n, sizes = len(batch), network.representation.sizes(batch.frames.shape[1])
     noise = torch.randn(n, 2, sizes[0], 99), torch.randn(n, sizes[1], network.representation.object_features)
     motions = []
     for shift in (torch.zeros(3), SHIFT_M):
         shifted = replace(batch, points_m=batch.points_m + shift)
-        condition = Condition.of(shifted, batch.text.new_zeros(n, 16), batch.text[:, 0], batch.contact)
+        condition = Condition(shifted, batch.text[:, 0], [None] * n, batch.contact)
         hands, objects = generator.sample(condition, SamplerConfig(steps=2), noise, torch.Generator())
         at_old_origin = placed_at(objects, shift)
         start = at_old_origin[:, :1, OBJECT_POSITION]

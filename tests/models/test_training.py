@@ -16,10 +16,12 @@ import trimesh
 from safetensors import safe_open
 from torch import nn
 
+from hoidata.actions.action import Actions
 from hoidata.annotation.encoders import load_encoder
 from hoidata.batches.dataset import ClipBatch, HoiDataset
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_joints
+from hoidata.metrics.verb_ranges import VerbRanges
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.annotated import AnnotatedStore
@@ -29,10 +31,10 @@ from models.common.repeatable import make_repeatable
 from models.common.sampling import SamplerConfig
 from models.common.training import TrainingConfig, fit, learning_rate_factor, train_network
 from models.registry import load_network
-from models.text2hoi.diffusion import DiffusionModel
+from models.text2hoi.diffusion import DiffusionModel, MotionGenerator
 from models.text2hoi.generation import GeneratedMotion, Generator, MotionOptions
-from models.text2hoi.sampler import SamplingConfig, Text2Hoi
-from models.text2hoi.verb_check import VerbCheck
+from models.text2hoi.length import LengthModel
+from models.text2hoi.sampler import SamplingConfig
 from pipelines.generation import GenerationRequest, Models, generate_files
 from tests.models.toy import PARAMS, train
 
@@ -86,15 +88,11 @@ def test_a_wrong_or_missing_checkpoint_is_named(trained: Path, tmp_path: Path) -
         load_checkpoint(tmp_path, load_network("contact"))
 
 
-def test_a_trained_network_recognises_only_its_training_objects(trained: Path, annotated: AnnotatedStore) -> None:
-    network = load_checkpoint(trained / "diffusion", load_network("diffusion")).network
-    assert isinstance(network, DiffusionModel)
-    points = {sample.object_key: sample.points.points_m for sample in Corpus.of(annotated, 0).train}
-    summary = network.object_feature(torch.from_numpy(np.stack(list(points.values()))))
-    assert len(points) == 2
-    assert network._is_training_object(summary).tolist() == [[1], [1]]
-    longer = torch.from_numpy(points.popitem()[1]) * torch.tensor([1.0, 1.0, 1.5])
-    assert network._is_training_object(network.object_feature(longer[None])).tolist() == [[0]]
+def test_a_trained_network_stores_the_verbs_of_its_training_clips(trained: Path) -> None:
+    for name in ("length", "diffusion"):
+        network = load_checkpoint(trained / name, load_network(name)).network
+        assert isinstance(network, DiffusionModel | LengthModel)
+        assert network.config.verbs == ("lift", "open", "pass")
 
 
 def test_a_checkpoint_with_an_unknown_setting_must_be_trained_again(trained: Path, tmp_path: Path) -> None:
@@ -182,15 +180,19 @@ def test_generation_uses_the_models_settings_except_for_given_options(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
-    options, load = dict[str, Any](), Generator.load
+    options, load, sample, denoisers = dict[str, Any](), Generator.load, MotionGenerator.sample, []
+    monkeypatch.setattr(
+        MotionGenerator, "sample", lambda self, *inputs: denoisers.append(inputs[1]) or sample(self, *inputs)
+    )
     monkeypatch.setattr(Generator, "load", lambda *arguments, **more: options.update(more) or load(*arguments, **more))
-    sampling = SamplingConfig(SamplerConfig("dpm++", 3), max_attempts=1)
+    sampling = SamplingConfig(SamplerConfig("dpm++", 3))
     models = Models(trained, load_embedded_hands(), load_encoder("hash"), sampling=sampling, points=256)
     request = GenerationRequest(
-        "Lift a box.", tmp_path / "box.stl", models=models, wish=MotionOptions(frames=8), sampler={"steps": 2}
+        "Lift a box.", tmp_path / "box.stl", models=models, options=MotionOptions(frames=8), sampler={"steps": 2}
     )
     generate_files(request, tmp_path / "out")
-    assert options == {"sampling": replace(sampling, sampler=SamplerConfig("dpm++", 2)), "points": 256}
+    assert options == {"sampling": sampling, "points": 256}
+    assert denoisers == [SamplerConfig("dpm++", 2)]
     generated = load(trained, models.hands, models.encoder, **options).generate(
         "Lift a box.", user_box(), MotionOptions(frames=8)
     )[0]
@@ -203,27 +205,32 @@ def test_a_mesh_file_whose_name_is_no_text_is_read_and_its_name_stays_legible(tr
     (tmp_path / "box.stl").rename(mesh)
     models = Models(trained, load_embedded_hands(), load_encoder("hash"))
     generate_files(
-        GenerationRequest("Lift a box.", mesh, models=models, wish=MotionOptions(frames=8)), tmp_path / "out"
+        GenerationRequest("Lift a box.", mesh, models=models, options=MotionOptions(frames=8)), tmp_path / "out"
     )
     assert (tmp_path / "out/index.html").is_file()
     assert read_user_object(mesh).model.name == "b\\udcffx"
 
 
 @pytest.mark.parametrize(
-    ("refined_by", "frames", "used"),
+    ("refine", "frames", "used"),
     [
-        ("contact_refinement", None, {"contact", "diffusion", "length"}),
-        ("contact_refinement", 8, {"contact", "diffusion"}),
+        ("contact", None, {"contact", "diffusion", "length"}),
+        ("none", 8, {"contact", "diffusion"}),
         ("network", 8, {"contact", "diffusion", "refiner"}),
     ],
 )
 def test_a_motion_lists_exactly_the_networks_that_generated_it(
-    trained: Path, tmp_path: Path, refined_by: Any, frames: int | None, used: set[str]
+    trained: Path, tmp_path: Path, refine: str, frames: int | None, used: set[str]
 ) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
-    sampling = SamplingConfig(refined_by=refined_by, max_attempts=1)
-    models = Models(trained, load_embedded_hands(), load_encoder("hash"), sampling=sampling)
-    request = GenerationRequest("Lift a box.", tmp_path / "box.stl", models=models, wish=MotionOptions(frames=frames))
+    models = Models(trained, load_embedded_hands(), load_encoder("hash"))
+    request = GenerationRequest(
+        "Lift a box.",
+        tmp_path / "box.stl",
+        models=models,
+        options=MotionOptions(frames=frames),
+        sampling={"refine": refine},
+    )
     generate_files(request, tmp_path / "out")
     named = json.loads(str(np.load(tmp_path / "out" / "motion.npz")["checkpoints"]))
     files = {name: trained / name / "model.safetensors" for name in PARAMS}
@@ -238,36 +245,21 @@ def test_unseen_words_are_reported(trained: Path) -> None:
         "Juggle three oranges with both hands.", user_box(), MotionOptions(frames=8)
     )[0]
     assert "the verb 'juggle' was never in training" in generated.evidence["unseen"][0]
-    verb, probability = generated.evidence["read_as"]
-    assert verb in ("lift", "open", "pass")
-    assert 1 / 3 <= probability <= 1
+    assert generated.evidence["verb"] is None
 
 
-def test_training_verbs_are_classified_correctly(trained: Path) -> None:
+def test_training_verbs_are_parsed(trained: Path) -> None:
     sentences = {"lift": "Lift a box with the left hand.", "pass": "Pass a box with the right hand."}
     for verb, text in sentences.items():
         generated = generator(trained).generate(text, user_box(), MotionOptions(frames=8))[0]
-        assert generated.evidence["read_as"][0] == verb
-
-
-def test_a_sentence_classified_as_another_verb_is_reported(trained: Path, tmp_path: Path) -> None:
-    trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
-    models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), MotionOptions(frames=8)
-    notes = {}
-    for text in ("Lift a box with the left hand.", "Juggle a box with both hands."):
-        request = GenerationRequest(text, tmp_path / "box.stl", models=models, wish=wish, force=True)
-        notes[text] = [note for note in generate_files(request, tmp_path / "out").notes if "classified as '" in note]
-    assert [len(own_notes) for own_notes in notes.values()] == [0, 1]
-    page = (tmp_path / "out" / "index.html").read_text()
-    read_as = notes["Juggle a box with both hands."][0].split("'")[1]
-    assert f"{read_as} (" in page
+        assert generated.evidence["verb"] == verb
 
 
 def test_a_second_action_of_a_sentence_is_reported_as_missing(trained: Path, tmp_path: Path) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
-    models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), MotionOptions(frames=8)
+    models, options = Models(trained, load_embedded_hands(), load_encoder("hash")), MotionOptions(frames=8)
     request = GenerationRequest(
-        "Lift a box and pass it with the left hand.", tmp_path / "box.stl", models=models, wish=wish
+        "Lift a box and pass it with the left hand.", tmp_path / "box.stl", models=models, options=options
     )
     note = "a motion shows one action: this one shows 'lift', not 'pass'; generate each alone"
     assert note in generate_files(request, tmp_path / "out").notes
@@ -275,10 +267,10 @@ def test_a_second_action_of_a_sentence_is_reported_as_missing(trained: Path, tmp
 
 def test_an_unknown_word_is_refused_unless_forced(trained: Path, tmp_path: Path) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
-    models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), MotionOptions(frames=8)
+    models, options = Models(trained, load_embedded_hands(), load_encoder("hash")), MotionOptions(frames=8)
 
     def notes(text: str, force: bool = False) -> list[str]:
-        request = GenerationRequest(text, tmp_path / "box.stl", models=models, wish=wish, force=force)
+        request = GenerationRequest(text, tmp_path / "box.stl", models=models, options=options, force=force)
         return generate_files(request, tmp_path / "out").notes
 
     for text in ("Throw the ball with the left hand.", "Juggle a box with both hands."):
@@ -290,14 +282,16 @@ def test_an_unknown_word_is_refused_unless_forced(trained: Path, tmp_path: Path)
     assert "'Lfit' is read as 'lift'" in notes("Lfit the box with the left hand.")
     with pytest.raises(BadInput, match=r"got 'bax'; did you mean 'box'"):
         notes("Lift the bax with the left hand.")
-    assert any("classified as '" in note for note in notes("Throw the ball with the left hand.", force=True))
+    assert any(
+        "'throw' was never in training" in note for note in notes("Throw the ball with the left hand.", force=True)
+    )
 
 
 def test_a_hand_that_the_sentence_does_not_name_is_reported(trained: Path, tmp_path: Path) -> None:
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
-    models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), MotionOptions(frames=8)
+    models, options = Models(trained, load_embedded_hands(), load_encoder("hash")), MotionOptions(frames=8)
     requests = {
-        text: GenerationRequest(text, tmp_path / "box.stl", models=models, wish=wish)
+        text: GenerationRequest(text, tmp_path / "box.stl", models=models, options=options)
         for text in ("Lift it.", "Lift it with the left hand.")
     }
     notes = {
@@ -318,7 +312,7 @@ def test_an_open_mesh_and_a_repaired_one_are_reported(trained: Path, tmp_path: P
     for name, mesh in meshes.items():
         mesh.export(tmp_path / f"{name}.obj")
         request = GenerationRequest(
-            "Lift a box with the left hand.", tmp_path / f"{name}.obj", models=models, wish=MotionOptions(frames=8)
+            "Lift a box with the left hand.", tmp_path / f"{name}.obj", models=models, options=MotionOptions(frames=8)
         )
         notes[name] = [note for note in generate_files(request, tmp_path / "out").notes if note.startswith("mesh: ")]
     assert notes == {
@@ -336,17 +330,22 @@ def test_visible_differences_are_reported_and_the_page_has_the_others(
     trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
     models = Models(trained, load_embedded_hands(), load_encoder("hash"))
     request = GenerationRequest(
-        "Lift a box with the left hand.", tmp_path / "box.stl", models=models, wish=MotionOptions(frames=8)
+        "Lift a box with the left hand.",
+        tmp_path / "box.stl",
+        models=models,
+        options=MotionOptions(frames=8),
+        sampling={"attempts": 5},
     )
-    monkeypatch.setattr(Text2Hoi, "refined_by", "contact_refinement")
-    monkeypatch.setattr("models.text2hoi.generation._contact_faults", lambda *_: [])
-    monkeypatch.setattr("models.text2hoi.generation._is_still", lambda *_: False)
-    monkeypatch.setattr(VerbCheck, "unusual", lambda self, request, numbers: ("rise_m 9 (usual: 0 to 1)", "path_m 8"))
+    monkeypatch.setattr("hoidata.metrics.verb_ranges._contact_faults", lambda *_: [])
+    monkeypatch.setattr("hoidata.metrics.verb_ranges._depth_faults", lambda *_: [])
+    monkeypatch.setattr("hoidata.metrics.verb_ranges._is_still", lambda *_: False)
+    monkeypatch.setattr(VerbRanges, "rank", lambda *_: (1, 0.0, 0.0))
+    monkeypatch.setattr(Actions, "unusual", lambda self, verb, numbers: ("rise_m 9 (usual: 0 to 1)", "path_m 8"))
     notes = {}
     for verb in ("lift", "open"):
-        monkeypatch.setattr(VerbCheck, "moved_as", lambda self, numbers, verb=verb: verb)
+        monkeypatch.setattr(Actions, "nearest_verb", lambda self, numbers, verb=verb: verb)
         for visible in ((), ("rise_m 9 (usual: 0 to 1)",)):
-            monkeypatch.setattr(VerbCheck, "seen", lambda self, request, numbers, visible=visible: visible)
+            monkeypatch.setattr(Actions, "visibly_unusual", lambda self, verb, numbers, visible=visible: visible)
             all_notes = generate_files(request, tmp_path / verb).notes
             notes[verb, len(visible)] = [note for note in all_notes if note.startswith("sample 1")]
     assert notes == {
@@ -393,9 +392,9 @@ def test_generation_refuses_other_hands_and_encoders(trained: Path) -> None:
 
 
 def test_hands_and_encoder_default_to_those_of_the_networks(trained: Path) -> None:
-    wish, tracks = MotionOptions(frames=8), []
+    options, tracks = MotionOptions(frames=8), []
     for loaded in (Generator.load(trained), generator(trained)):
-        tracks.append(loaded.generate("Lift a box with the left hand.", user_box(), wish)[0].clip.hands["left"])
+        tracks.append(loaded.generate("Lift a box with the left hand.", user_box(), options)[0].clip.hands["left"])
     np.testing.assert_array_equal(tracks[0].wrist_m, tracks[1].wrist_m)
 
 

@@ -3,12 +3,12 @@
 import pytest
 
 from hoidata.annotation.encoders import load_encoder
+from hoidata.annotation.sentence_check import further_verbs, is_english, read_sentence, unseen_words
+from hoidata.annotation.vocabulary import Vocabulary
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
 from hoidata.store.annotated import AnnotatedStore
 from models.common.corpus import Corpus
-from models.common.vocabulary import Vocabulary
-from models.text2hoi.sentences import further_verbs, is_english, read_sentence, unseen_words
 
 KNOWN = Vocabulary({("lift", "mug", "right"): 5, ("pour", "teapot", "right"): 3, ("lift", "teapot", "left"): 2})
 

@@ -8,9 +8,9 @@ import pytest
 from hoidata.annotation.encoders import load_encoder
 from hoidata.annotation.hand_choice import HAND_TYPES
 from hoidata.annotation.sentences import FORMS, english_sentences, reference_sentences
+from hoidata.annotation.vocabulary import Vocabulary
+from hoidata.annotation.wording import Wording, edit_distance, understood_words
 from hoidata.errors import BadInput
-from models.common.vocabulary import Vocabulary
-from models.text2hoi.wording import Wording, edit_distance, understood_words
 
 VERBS = ("lift", "drink", "pour", "place", "take out", "inspect", "hand over", "pass")
 OBJECTS = ("mug", "water bottle", "wine glass", "large cube", "box", "book")

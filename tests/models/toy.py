@@ -19,8 +19,7 @@ PARAMS = {
         "network": {
             "width": 16,
             "sampled_from": "gaussian",
-            "text_input": "verb_probabilities",
-            "condition_on_hands_and_length": True,
+            "verb_input": True,
         },
         "training": {**BUDGET, "keep_best": True},
     },
@@ -28,35 +27,41 @@ PARAMS = {
         "network": {
             "transformer": TRANSFORMER,
             "contact_input": "tokens",
-            "text_input": "verb_probabilities",
+            "verb_input": True,
             "motion": {"knot_frames": 4},
-            "normalised": True,
-            "condition_on_hands_and_length": True,
-            "object_dropout": 0.5,
-            "scale_input": False,
+            "signal_scale": 1.0,
         },
         "training": BUDGET,
     },
     "refiner": {
         "network": {
             "transformer": TRANSFORMER,
-            "contact_map": False,
-            "view": "object",
-            "surface_input": True,
             "output": "residual",
         },
         "training": BUDGET,
-        "loss": {"coarse_motions": "half_sampled", "samples": 2, "sampler_steps": 2, "field_resolution": 16},
     },
 }
 
 
-def train(name: str, root: Path, out: Path, device: str = "cpu") -> Path:
+# Preset `paper` with small layers.
+SMALL_TRANSFORMER = {"width": 32, "layers": 1, "heads": 2, "feed_forward": 32}
+PAPER = {
+    "contact": {"network": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8]}, "training": BUDGET},
+    "length": {"network": {"width": 16}, "training": BUDGET},
+    "diffusion": {"network": {"transformer": SMALL_TRANSFORMER}, "training": BUDGET},
+    "refiner": {
+        "network": {"transformer": SMALL_TRANSFORMER},
+        "training": BUDGET,
+    },
+}
+
+
+def train(name: str, root: Path, out: Path, device: str = "cpu", params: dict = PARAMS) -> Path:
     network = load_network(name)
     needed = {load_network(other): out / other for other in network.needs}
     provenance = lambda facts: {"model": facts["model"]}  # noqa: E731
-    return train_network(network, root, out / name, PARAMS[name], needed=needed, provenance=provenance, device=device)
+    return train_network(network, root, out / name, params[name], needed=needed, provenance=provenance, device=device)
 
 
 # Sections of families with which sampling takes a moment.
-FAST = {"text2hoi": {"sampler": {"steps": 2}, "field_resolution": 16}}
+FAST = {"text2hoi": {"sampler": {"steps": 2}}}

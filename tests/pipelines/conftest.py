@@ -39,10 +39,9 @@ TINY = {
     "refiner": {
         "network": {"transformer": TRANSFORMER},
         "training": BUDGET,
-        "loss": {"samples": 2, "sampler_steps": 2, "field_resolution": 16},
     },
 }
-TINY_SAMPLE = {"samples": 2, "text2hoi": {"sampler": {"steps": 2}, "field_resolution": 16}}
+TINY_SAMPLE = {"samples": 2, "text2hoi": {"sampler": {"steps": 2}}}
 
 
 def copy_project(folder: Path) -> Path:

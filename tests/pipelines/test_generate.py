@@ -1,15 +1,19 @@
 """``hoidata generate``: refused input, the choice of models, and the note on a missing hinge."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import trimesh
 import yaml
 from typer.testing import CliRunner
 
+from hoidata.annotation.vocabulary import Vocabulary
 from hoidata.errors import BadInput, MissingResource
 from hoidata.objects.user_mesh import read_user_object
-from models.common.vocabulary import Vocabulary
+from models.common.checkpoints import FILE_NAME
+from models.text2hoi.generation import MotionOptions
 from models.text2hoi.sampler import SamplingConfig
 from pipelines.cli import app
 from pipelines.generation import (
@@ -17,8 +21,10 @@ from pipelines.generation import (
     Models,
     _clips_with,
     _missing_hinge_notes,
+    _networks,
     _project_models,
     chosen_model,
+    why_not_trained,
 )
 from pipelines.stages.base import StagePaths
 from tests.pipelines.conftest import PROJECT
@@ -81,7 +87,8 @@ def test_a_name_longer_than_a_file_name_may_be_is_refused(words, tmp_path) -> No
 
 def test_a_dataset_without_models_is_refused_with_a_list_of_those_that_have_them(monkeypatch) -> None:
     monkeypatch.setattr(
-        "pipelines.generation.why_not_trained", lambda paths: None if paths.dataset == "grab" else "not there"
+        "pipelines.generation.why_not_trained",
+        lambda paths, networks: None if paths.dataset == "grab" else "not there",
     )
     with pytest.raises(MissingResource, match=r"embedded-nope: not there; these datasets have models: grab$"):
         chosen_model(GenerationRequest("Lift a box.", "box", "embedded", ("h2o", "grab"), model="nope"), "lift", "box")
@@ -98,7 +105,7 @@ def three_datasets(monkeypatch) -> tuple[str, ...]:
         "arctic": {("pour", "kettle", "right"): 3, ("open", "box", "right"): 4},
     }
     objects = {"h2o": {"bottle", "milk"}, "grab": {"mug"}, "arctic": {"kettle"}}
-    monkeypatch.setattr("pipelines.generation.why_not_trained", lambda paths: None)
+    monkeypatch.setattr("pipelines.generation.why_not_trained", lambda paths, networks: None)
     monkeypatch.setattr("pipelines.generation._vocabulary", lambda path: Vocabulary(counts[path.name]))
     monkeypatch.setattr("pipelines.generation._has_object", lambda paths, name: name in objects[paths.dataset])
     return tuple(counts)
@@ -157,11 +164,10 @@ PARAMS = yaml.safe_load((PROJECT / "params.yaml").read_text())
 
 
 def test_encoder_points_and_sampling_are_those_of_the_requested_profile(models_of) -> None:
-    """Except half precision, which is slow on a CPU."""
     overlay = {
         "annotate": {"encoder": "hash"},
         "contact": {"points": 512},
-        "sample": {"text2hoi": {"max_attempts": 1, "precision": "float16"}},
+        "sample": {"text2hoi": {"attempts": 3, "refine": "contact"}},
     }
     values = {**PARAMS, "profile": "embedded", "profiles": {"own": overlay}}
     models = [models_of(profile, values) for profile in ("embedded", "own")]
@@ -169,8 +175,7 @@ def test_encoder_points_and_sampling_are_those_of_the_requested_profile(models_o
         ("embedded", "use", 1024),
         ("own", "hash", 512),
     ]
-    assert [entry.sampling.max_attempts for entry in models] == [5, 1]
-    assert {entry.sampling.precision for entry in models} == {"float32"}
+    assert [(entry.sampling.attempts, entry.sampling.refine) for entry in models] == [(1, "network"), (3, "contact")]
 
 
 @pytest.mark.parametrize("sample", [{"sample": None}, {}])
@@ -225,3 +230,26 @@ def test_a_mesh_with_a_hinge_and_a_verb_that_turns_none_give_no_note(box):
     assert not notes("open", box, HINGE)
     assert not notes("lift", box)
     assert not notes(None, box)
+
+
+def test_a_request_needs_only_the_networks_that_it_uses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "params.yaml").write_text((PROJECT / "params.yaml").read_text())
+    request = GenerationRequest("Lift a box.", "box", "embedded", ("grab",))
+    given_length = replace(request, options=MotionOptions(frames=9))
+    needed = {
+        "length": (request, ["contact", "diffusion", "length", "refiner"]),
+        "no length": (given_length, ["contact", "diffusion", "refiner"]),
+        "contact refinement": (replace(request, sampling={"refine": "contact"}), ["contact", "diffusion", "length"]),
+        "neither": (replace(given_length, sampling={"refine": "none"}), ["contact", "diffusion"]),
+    }
+    assert {name: _networks(asked) for name, (asked, _) in needed.items()} == {
+        name: networks for name, (_, networks) in needed.items()
+    }
+    paths = StagePaths("embedded", "grab")
+    for name in ("contact", "diffusion"):
+        (paths.checkpoints / name).mkdir(parents=True)
+        (paths.checkpoints / name / FILE_NAME).touch()
+    assert "length" in (why_not_trained(paths, needed["length"][1]) or "")
+    assert "refiner" in (why_not_trained(paths, needed["no length"][1]) or "")
+    assert why_not_trained(paths, needed["neither"][1]) is None

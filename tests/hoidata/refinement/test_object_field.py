@@ -5,7 +5,7 @@ import pytest
 
 from hoidata.clips.clip import ObjectTrack
 from hoidata.refinement.object_field import ObjectField
-from tests.builders.objects import box_model, two_parts
+from tests.builders.objects import box_model
 
 STILL = np.zeros((1, 3), np.float32)
 
@@ -21,11 +21,3 @@ def test_distances_of_any_proportions(sizes_m):
     distance = field.distances(points_m[None])[0][0]
     np.testing.assert_allclose(distance[1:], heights[1:], atol=0.001)
     assert distance[0] < 0
-    assert 0 < field.most_depth_m(0) <= 0.5 * min(sizes_m)
-
-
-def test_each_part_has_its_largest_depth():
-    base, lid = box_model((0.1, 0.1, 0.1)), box_model((0.1, 0.1, 0.01))
-    model = two_parts(base, lid, (0, 1, 0))
-    field = ObjectField(ObjectTrack(model, STILL, STILL, np.zeros(1, np.float32)))
-    np.testing.assert_allclose([field.most_depth_m(part) for part in (0, 1)], [0.05, 0.005], atol=0.002)

@@ -30,15 +30,15 @@ def motion(page_clip):
         "seed": 7,
         "number": 0,
         "hand": hand,
-        "read_as": ("lift", 0.97),
-        "draws": 3,
+        "verb": "lift",
+        "attempts": 3,
         "moved_as": "pour",
         "unusual": ["highest rise 15.8 cm (usual: <19.1> to 23.7)"],
         "synthetic": True,
         "unseen": ["the object 'vase' was never in training"],
         "contact_threshold_m": 0.02,
         "checkpoints": {"contact": "ab" * 32},
-        "refined_by": "contact_refinement",
+        "refine": "contact",
         "trained_on": {"grab": 12},
     }
     coarse, contact = page_clip(frames=clip.n_frames), points.points_m[:, 0] > 0.039

@@ -15,10 +15,8 @@ from lemminflect import getAllLemmas
 from hoidata.annotation.encoders import TextEncoder
 from hoidata.annotation.grammar import default_grammar, default_phrases
 from hoidata.annotation.hand_choice import PHRASES
-from hoidata.annotation.prompts import HAND_PHRASE
-from hoidata.errors import BadInput
-from models.common.vocabulary import Vocabulary
-from models.text2hoi.sentences import (
+from hoidata.annotation.prompts import HAND_PHRASE, read_prompt
+from hoidata.annotation.sentence_check import (
     FUNCTION_WORDS,
     LEFT_OF_NOUNS,
     first_verb,
@@ -26,6 +24,8 @@ from models.text2hoi.sentences import (
     nearest_words,
     read_sentence,
 )
+from hoidata.annotation.vocabulary import Vocabulary
+from hoidata.errors import BadInput
 
 FORCE = "or add --force to generate from the sentence as it is typed"
 # Words from this length on may have any single edit; shorter ones only two exchanged letters.
@@ -73,10 +73,9 @@ def understood_words(
     notes = list[str]()
     if not force:
         text, notes = _corrected(text, vocabulary, names)
-    verb, noun = read_sentence(text)
-    verbs = sorted(filter(None, vocabulary.verbs))
-    if verb not in verbs:
-        verb = _with_particle(text, [*verbs, *PARAPHRASES, *filter(None, map(synonym_of, verbs))]) or verb
+    _, noun = read_sentence(text)
+    verbs = vocabulary.verb_names
+    verb = parsed_verb(text, verbs)
     if noun in (None, "hand"):
         noun = _phrase_after_article(text, verb)
     synonyms = (synonym_of(verb), PARAPHRASES.get(verb)) if verb else ()
@@ -87,6 +86,14 @@ def understood_words(
     if verbs and verb not in verbs and not force:
         raise _untrained(verb or first_verb(text), text, verbs, encoder)
     return Wording(text, verb, noun, tuple(notes))
+
+
+def parsed_verb(text: str, verbs: Sequence[str]) -> str | None:
+    """The verb of a sentence by the grammar, base form; separated verbs ("put it down") if similar to ``verbs``."""
+    verb = read_prompt(text).verb
+    if verb in verbs:
+        return verb
+    return _with_particle(text, [*verbs, *PARAPHRASES, *filter(None, map(synonym_of, verbs))]) or verb
 
 
 def _untrained(word: str | None, text: str, verbs: Sequence[str], encoder: Callable[[], TextEncoder]) -> BadInput:

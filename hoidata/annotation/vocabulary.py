@@ -38,6 +38,11 @@ class Vocabulary:
         return self._clips_by(0)
 
     @property
+    def verb_names(self) -> list[str]:
+        """The verbs in alphabetical order, without clips that have none."""
+        return sorted(filter(None, self.verbs))
+
+    @property
     def objects(self) -> Counter[str]:
         return self._clips_by(1)
 

@@ -8,9 +8,9 @@ from lemminflect import getAllLemmas
 
 from hoidata.annotation.encoders import TextEncoder
 from hoidata.annotation.prompts import read_prompt
+from hoidata.annotation.vocabulary import Vocabulary
 from hoidata.clips.clip import HandType
 from hoidata.errors import BadInput
-from models.common.vocabulary import Vocabulary
 
 LONGEST_WORDS = 60
 KNOWN_SHARE = 0.6

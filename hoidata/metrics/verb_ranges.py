@@ -1,0 +1,189 @@
+"""Compares a generated motion with the training clips of its verb; and its visible faults, in words.
+
+A few measures describe how the object moves (``hoidata.actions``), how fast the fastest joint is and how much touching
+joints slip. No test clip and no trained evaluator is involved.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from hoidata.actions.action import Actions, action_numbers, training_actions, usual_limits, verb_of
+from hoidata.batches.requests import ObjectPoints
+from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack, Side
+from hoidata.clips.slip import joint_slips_cm_s, touched_parts
+from hoidata.contact.proximity import ProximityIndex
+from hoidata.hands import HandPair, track_joints
+from hoidata.objects.surface_index import SurfaceIndex, surface_index
+from hoidata.refinement import carried_fraction
+from hoidata.store.annotated import AnnotatedStore
+from hoidata.surface.contact import HandInObjectFrame, deepest_m, hand_in_object_frame
+
+JOINT_SPEED = "joint_m_s"
+FASTER = 1.1  # than in any training clip
+SLIP = "slip_cm_s"
+LEAST_DEVIATION_CM_S = 0.05  # of slip, for recorded hands that never slip
+MIN_LIFT_FRACTION = 0.5  # of the checked frames in the air, in which the hands must be able to carry the object
+ACCEPTED = (2, 0.0)  # ranks that begin so need no further candidate
+
+
+@dataclass(frozen=True)
+class VerbRanges:
+    """Usual ranges of the training clips' measures, by verb."""
+
+    actions: Actions
+    threshold_m: float  # distance below which a joint touches
+    hands: HandPair
+
+    def numbers(self, clip: Clip, points: ObjectPoints) -> dict[str, float]:
+        """Measures of a clip: those of its object (``hoidata.actions``), ``JOINT_SPEED`` of the fastest joint, and mean
+        ``SLIP`` of touching joints.
+        """
+        index, touching, speeds = ProximityIndex(points), np.zeros((len(SIDES), clip.n_frames), bool), [0.0]
+        slips = [np.zeros(0)]
+        for row, side in enumerate(SIDES):
+            track = clip.hands[side]
+            if track.valid.any():
+                joints_m = track_joints(track, self.hands[side])
+                near = index.entries(joints_m, track.valid, clip.object, self.threshold_m)
+                touching[row, near["frame"]] = True
+                speeds.append(fastest_joint(joints_m, track.valid))
+                part = points.part[near["point"]]
+                touched = touched_parts(clip.n_frames, near["frame"], near["joint"], near["distance_m"], part)
+                slips.append(joint_slips_cm_s(clip.object, joints_m, touched))
+        own = {JOINT_SPEED: max(speeds), SLIP: _mean(np.concatenate(slips))}
+        return action_numbers(clip.object, clip.gravity, touching) | own
+
+    def is_other(self, verb: str | None, moved_as: str | None) -> bool:
+        """Whether a motion has another verb than the requested one; False if either is not known."""
+        return None not in (verb, moved_as) and verb in self.actions.centroids and moved_as != verb
+
+    def rank(self, verb: str | None, clip: Clip, points: ObjectPoints) -> tuple[int, float, float]:
+        """Rank of a candidate in rejection sampling; larger is better.
+
+        Number of criteria met: the hands can carry the object, and the object moves as in clips of ``verb``. Then the
+        largest violation of the verb's ranges, negative; that of a motion with another verb does not count, because
+        nearly every such motion has one. Then the fraction of frames in the air in which the hands can carry.
+        """
+        numbers, carried = self.numbers(clip, points), carried_fraction(self.hands, clip)
+        is_other = self.is_other(verb, self.actions.nearest_verb(numbers))
+        violation = 0.0 if is_other else max(self.actions.violations(verb or "", numbers).values(), default=0.0)
+        return int(carried >= MIN_LIFT_FRACTION) + (not is_other), -violation, carried
+
+
+def training_ranges(store: AnnotatedStore) -> Actions:
+    """Actions of the training clips; their usual ranges also bound joint speed and slip."""
+    speeds, slips = [0.0], dict[str, list[dict[str, float]]]()
+    for clip_id in store.ids("train"):
+        clip = store.clip(clip_id)
+        speeds += [fastest_joint(store.joints(clip_id, side), clip.hands[side].valid) for side in SIDES]
+        if verb := verb_of(store, clip_id):
+            slips.setdefault(verb, []).append({SLIP: _recorded_slip_cm_s(store, clip_id, clip.object)})
+    every = [own[SLIP] for rows in slips.values() for own in rows]
+    scale = {SLIP: (0.0, max(float(np.std(every)), LEAST_DEVIATION_CM_S))} if every else {}
+    most_slip = {verb: limits[SLIP][1] for verb, limits in usual_limits(slips, scale).items()}
+    # A corpus whose hands never move bounds nothing.
+    fastest = {JOINT_SPEED: (0.0, FASTER * max(speeds))} if max(speeds) else {}
+    actions = training_actions(store)
+    slip = {verb: {SLIP: (0.0, most_slip[verb])} if verb in most_slip else {} for verb in actions.centroids}
+    return replace(actions, usual={verb: actions.usual.get(verb, {}) | fastest | slip[verb] for verb in slip})
+
+
+def _recorded_slip_cm_s(store: AnnotatedStore, clip_id: str, thing: ObjectTrack) -> float:
+    """``SLIP`` of a recorded clip, from its stored distances."""
+    part, slips = store.points(store.object_key(clip_id)).part, []
+    for side in SIDES:
+        near = store.distances(clip_id, side)
+        touched = touched_parts(thing.n_frames, near.frame, near.joint, near.distance_m, part[near.point])
+        slips.append(joint_slips_cm_s(thing, store.joints(clip_id, side), touched))
+    return _mean(np.concatenate(slips))
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if len(values) else 0.0
+
+
+def fastest_joint(joints_m: np.ndarray, valid: np.ndarray) -> float:
+    """Speed in m/s of the fastest joint (F, 21, 3) between two frames that are ``valid`` (F,)."""
+    steps = np.linalg.norm(np.diff(joints_m.astype(np.float64), axis=0), axis=2)[valid[1:] & valid[:-1]]
+    return float(steps.max(initial=0.0)) * FPS
+
+
+GAP_M = 0.01  # between skin and surface: a larger gap is visible
+DEEP_M = 0.02  # a finger's thickness
+FLOATING_M = 0.02  # above the start: the object is in the air
+MIN_FRAMES = 3  # a tenth of a second; a shorter fault is not visible
+# An object that moves less does not move.
+STILL = {"path_m": 0.01, "tilt_deg": 5.0, "turn_deg": 5.0, "hinge_max_deg": 5.0}
+MOVES = {"path_m": 0.05, "hinge_max_deg": 10.0}  # of the mean training clip of a verb that moves its object
+
+
+def visible_faults(
+    clip: Clip, hands: HandPair, ranges: VerbRanges | None, verb: str | None, numbers: Mapping[str, float]
+) -> tuple[str, ...]:
+    """What a viewer sees to be wrong, in words: hands that never touch the object, are deep inside it or release it in
+    the air, a motionless object, and measures far outside the range of the verb's training clips.
+
+    Args:
+        ranges: of the training clips; None if the networks have none.
+        verb: the requested verb; None if not known.
+        numbers: ``VerbRanges.numbers``.
+    """
+    index = surface_index(clip.object.model)
+    active: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
+    placed: dict[Side, HandInObjectFrame] = {side: hand_in_object_frame(clip, side, hands) for side in active}
+    gaps: dict[Side, np.ndarray] = {side: _gap_m(hand, index) for side, hand in placed.items()}
+    faults = [*_contact_faults(clip, gaps), *_depth_faults(placed, index)]
+    if ranges is not None and verb is not None:
+        moved_as, visible = ranges.actions.nearest_verb(numbers), ranges.actions.visibly_unusual(verb, numbers)
+        if _is_still(numbers) and _moves_its_object(ranges.actions, verb):
+            faults.append("the object does not move")
+        elif visible:
+            other = f", more like {moved_as!r}" if ranges.is_other(verb, moved_as) else ""
+            faults.append(f"unlike {verb!r} in training{other}: {', '.join(visible)}")
+    return tuple(faults)
+
+
+def _gap_m(hand: HandInObjectFrame, index: SurfaceIndex) -> np.ndarray:
+    """(frame,) metres from the skin to the surface, infinite without the hand."""
+    return hand.expand_to_clip(index.distance_m(hand.vertices_m, hand.hinge_rad).min(axis=1), np.inf)
+
+
+def _contact_faults(clip: Clip, gap_m: Mapping[Side, np.ndarray]) -> list[str]:
+    distances = {side: float(gap.min()) for side, gap in gap_m.items() if gap.min() > GAP_M}
+    faults = [f"the {side} hand never touches the object ({gap * 100:.1f} cm away)" for side, gap in distances.items()]
+    if len(distances) < len(gap_m) and clip.gravity is not None:
+        height = -(clip.object.translation_m.astype(np.float64) @ np.asarray(clip.gravity, np.float64))
+        lifted = height - height[0] > FLOATING_M
+        alone = int((lifted & (np.min([*gap_m.values()], axis=0) > GAP_M)).sum())
+        faults += [f"the object is in the air and no hand touches it in {alone} frames"] * (alone >= MIN_FRAMES)
+    return faults
+
+
+def _depth_faults(placed: Mapping[Side, HandInObjectFrame], index: SurfaceIndex) -> list[str]:
+    if not index.is_solid:
+        return []
+    faults = []
+    for side, hand in placed.items():
+        depth = deepest_m(hand, index)
+        if (frames := int((depth > DEEP_M).sum())) >= MIN_FRAMES:
+            deepest = float(np.nanmax(depth)) * 100
+            faults.append(f"the {side} hand is up to {deepest:.1f} cm inside the object in {frames} frames")
+    return faults
+
+
+def _is_still(numbers: Mapping[str, float]) -> bool:
+    return all(numbers[name] < threshold for name, threshold in STILL.items())
+
+
+def _moves_its_object(actions: Actions, verb: str) -> bool:
+    """Whether the mean training clip of a verb moves its object."""
+    if verb not in actions.centroids:
+        return False
+    measures: dict[str, Any] = {
+        name: float(value) * deviation + mean
+        for value, (name, (mean, deviation)) in zip(actions.centroids[verb], actions.scale.items(), strict=True)
+    }
+    return any(measures.get(name, 0.0) > threshold for name, threshold in MOVES.items())
