@@ -22,14 +22,13 @@ from models.manipnet.animate import (
     Gap,
     at_30_fps,
     clip_of,
-    control_from_clip,
     control_from_file,
     gap_of,
     interpolate_fingers,
     predict_fingers,
     with_fingers,
 )
-from models.manipnet.control import hands_of
+from models.manipnet.control import control_from_clip, hands_of
 from models.manipnet.network import ManipNet
 from models.manipnet.rollout import Predictor, Rule
 from models.manipnet.training import MANIPNET
@@ -53,7 +52,7 @@ class AnimationOptions:
     sides: tuple[Side, ...] = SIDES  # hands to animate, if the recording has them
     frames: str = ""  # of a clip: "30:90", or "" for all
     model: str = ""  # the dataset whose network to use; "" for the clip's dataset, else the first that has one
-    rule: Rule = "ours"
+    rule: Rule = "preset"
     object: str = ""  # of a file of trajectories: a mesh file, or the name of an object of the dataset
     unit: str = ""  # of positions in a file of trajectories
     axes: Axes = "model"  # of the wrists in a file of trajectories
@@ -271,8 +270,9 @@ def chosen_network(options: AnimationOptions, project: ProjectData) -> Network:
     paths, facts = trained_run("manipnet", [MANIPNET.name], options.model, project)
     checkpoint = load_checkpoint(paths.checkpoints / MANIPNET.name, MANIPNET, torch.device("cpu"))
     assert isinstance(checkpoint.network, ManipNet)
-    rows = [("network", str(paths)), ("trained on", trained_on(facts)), ("post-processing", options.rule)]
-    return Network(Predictor(checkpoint.network, options.rule), rows, facts)
+    predictor = Predictor(checkpoint.network, options.rule)
+    rows = [("network", str(paths)), ("trained on", trained_on(facts)), ("post-processing", predictor.chosen_rule)]
+    return Network(predictor, rows, facts)
 
 
 def _frames(text: str, n_frames: int) -> slice:

@@ -8,12 +8,12 @@ import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.errors import BadInput
-from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.hands.tracks import track_rotmats
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
-from models.manipnet.control import Control, Motion, interpolate_rotations, nearest_tracked_frames, untracked_wrist
+from models.manipnet.control import Control, Motion, interpolate_rotations
 from models.manipnet.plausible import plausible_reading
 from models.manipnet.rollout import Predictor, RolloutTask, roll_out
 from models.manipnet.trajectory_files import MAX_FRAMES, TrajectoryFile
@@ -63,32 +63,7 @@ def at_30_fps(control: Control) -> Control:
         raise BadInput(
             "time_s", f"at most {MAX_FRAMES} frames at {FPS} per second", f"{n_frames}", "cut it into pieces"
         )
-    time_s = control.object_motion.time_s[0] + np.arange(n_frames) / FPS
-    hinge = control.hinge_at(time_s)
-
-    def resampled(motion: Motion) -> Motion:
-        transform = motion.at(time_s)
-        return Motion(time_s, transform.rotation, transform.translation)
-
-    wrists: dict[Side, Motion] = {side: resampled(motion) for side, motion in control.wrists.items()}
-    return Control(wrists, resampled(control.object_motion), control.model, hinge)
-
-
-def control_from_clip(clip: Clip) -> Control:
-    """Wrists and object of a recorded clip; an untracked wrist has its pose of the nearest tracked frame."""
-    time_s = np.arange(clip.n_frames) / FPS
-    transform = clip.object.world_from_object
-    object_motion = Motion(time_s, transform.rotation, transform.translation)
-    hinge = None if clip.object.hinge_rad is None else np.asarray(clip.object.hinge_rad, dtype=np.float64)
-    wrists: dict[Side, Motion] = {}
-    for side, track in clip.hands.items():
-        frames = nearest_tracked_frames(track.valid)
-        if frames is None:
-            wrists[side] = untracked_wrist(time_s, object_motion.position_m)
-        else:
-            rotmats = rotvec_to_rotmat(track.global_orient[frames].astype(np.float64))
-            wrists[side] = Motion(time_s, rotmats, track.wrist_m[frames].astype(np.float64))
-    return Control(wrists, object_motion, clip.object.model, hinge)
+    return control.at(control.object_motion.time_s[0] + np.arange(n_frames) / FPS)
 
 
 class Gap(NamedTuple):
@@ -126,7 +101,7 @@ def predict_fingers(predictor: Predictor, hand: TrackedHand, side: Side, control
         predictor: the network.
         hand: skeleton and capsules of the hand.
         side: of the hand.
-        control: wrists and object; its frames are one step apart.
+        control: wrists and object at 30 fps.
         gap: the frames to fill.
         seam_s: duration of the blend.
     """
@@ -135,7 +110,7 @@ def predict_fingers(predictor: Predictor, hand: TrackedHand, side: Side, control
     time_s = control.object_motion.time_s[gap.first - known_frames : gap.stop]
     task = RolloutTask(hand=hand, side=side, control=control, time_s=time_s, start=start)
     (predicted,) = roll_out(predictor, [task])
-    return blend_ends(predicted[known_frames:], gap.before, gap.after, round(seam_s / predictor.settings.step_s))
+    return blend_ends(predicted[known_frames:], gap.before, gap.after, round(seam_s * FPS))
 
 
 def interpolate_fingers(gap: Gap) -> np.ndarray:

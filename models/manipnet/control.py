@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from hoidata.batches.dataset import ClipSample
 from hoidata.batches.requests import Trajectories
-from hoidata.clips.clip import FPS, SIDES, Side
+from hoidata.clips.clip import FPS, SIDES, Clip, Side
 from hoidata.clips.features import (
     GLOBAL_ORIENT_6D,
     HAND_POSE_6D,
@@ -18,6 +17,8 @@ from hoidata.clips.features import (
     OBJECT_POSITION,
     OBJECT_ROTATION_6D,
     WRIST,
+    hand_features,
+    object_features,
 )
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
@@ -47,19 +48,14 @@ class Motion:
         before = np.searchsorted(self.time_s[1:-1], time, side="right")
         after = np.minimum(before + 1, len(self.time_s) - 1)
         since, until = time - self.time_s[before], self.time_s[after] - time
-        on_frame = np.minimum(since, until) <= _FRAME_TOLERANCE * (since + until)
         frame = np.where(since <= until, before, after)
         rotation, position_m = self.rotmats[frame], self.position_m[frame]
-        if not on_frame.all():
-            interpolated = self._slerp(time.ravel()).as_matrix().reshape(*time.shape, 3, 3)
-            columns = [np.interp(time, self.time_s, column) for column in self.position_m.T]
-            rotation = np.where(on_frame[..., None, None], rotation, interpolated)
-            position_m = np.where(on_frame[..., None], position_m, np.stack(columns, axis=-1))
+        between = np.minimum(since, until) > _FRAME_TOLERANCE * (since + until)
+        start, stop, fraction = before[between], after[between], (since / np.maximum(since + until, 1e-12))[between]
+        rotation[between] = interpolate_rotations(self.rotmats[start], self.rotmats[stop], fraction)
+        start_m = self.position_m[start]
+        position_m[between] = start_m + fraction[:, None] * (self.position_m[stop] - start_m)
         return RigidTransform(rotation, position_m)
-
-    @cached_property
-    def _slerp(self) -> Slerp:
-        return Slerp(self.time_s, Rotation.from_matrix(self.rotmats))
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +72,23 @@ class Control:
         """(3,) centre of the object's bounding box, object frame, hinge at 0."""
         return (self.model.vertices_m.min(axis=0) + self.model.vertices_m.max(axis=0)) / 2
 
+    @cached_property
+    def mass_centre_m(self) -> np.ndarray:
+        """(3,) centre of mass of all parts, object frame, hinge at 0; parts without a volume count equally."""
+        volumes = np.array([part.volume_m3 for part in self.model.masses])
+        weights = volumes if volumes.sum() > 0 else np.ones(len(volumes))
+        return np.average([part.centre_m for part in self.model.masses], axis=0, weights=weights)
+
+    def at(self, time_s: np.ndarray) -> "Control":
+        """Resample at times (frame,)."""
+
+        def taken(motion: Motion) -> Motion:
+            pose = motion.at(time_s)
+            return Motion(time_s, pose.rotation, pose.translation)
+
+        wrists: dict[Side, Motion] = {side: taken(motion) for side, motion in self.wrists.items()}
+        return Control(wrists, taken(self.object_motion), self.model, self.hinge_at(time_s))
+
     def hinge_at(self, time_s: np.ndarray) -> np.ndarray | None:
         """Hinge angles at times of any shape, radians; None for a rigid object."""
         if self.hinge_rad is None:
@@ -87,20 +100,29 @@ UNTRACKED_DISTANCE_M = 1.0  # from the object to a wrist that is never tracked: 
 
 
 def interpolate_rotations(start: np.ndarray, stop: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-    """Interpolate rotations (frame, joint, 3, 3) by slerp; fraction (frame,): 0 is ``start``, 1 is ``stop``."""
+    """Interpolate rotations (frame, ..., 3, 3) by slerp; fraction (frame,): 0 is ``start``, 1 is ``stop``."""
     rotvec = rotmat_to_rotvec(start.swapaxes(-1, -2) @ stop)
-    return start @ rotvec_to_rotmat(fraction[:, None, None] * rotvec)
+    return start @ rotvec_to_rotmat(fraction.reshape(-1, *[1] * (rotvec.ndim - 1)) * rotvec)
+
+
+def poses_at(poses: np.ndarray, frame: np.ndarray) -> np.ndarray:
+    """Poses (frame, joint, 3, 3) at fractional frame numbers (time,): the frame's own bits at whole numbers."""
+    before = np.floor(frame + _FRAME_TOLERANCE).astype(int)
+    between = np.flatnonzero(frame - before > _FRAME_TOLERANCE)
+    start, stop, chosen = before[between], np.minimum(before[between] + 1, len(poses) - 1), poses[before]
+    chosen[between] = interpolate_rotations(poses[start], poses[stop], (frame - before)[between])
+    return chosen
 
 
 def control_of(trajectories: Trajectories, model: ObjectModel) -> Control:
     """Wrists and object at 30 fps from time 0; an untracked wrist has its pose of the nearest tracked frame."""
     time_s = np.arange(len(trajectories.object)) / FPS
-    object_features = trajectories.object.astype(np.float64)
-    hinge = object_features[:, OBJECT_HINGE] if model.is_articulated else None
+    body_features = trajectories.object.astype(np.float64)
+    hinge = body_features[:, OBJECT_HINGE] if model.is_articulated else None
     wrists: dict[Side, Motion] = {
         side: _wrist(trajectories, side_index, time_s) for side_index, side in enumerate(SIDES)
     }
-    body = Motion(time_s, rot6d_to_rotmat(object_features[:, OBJECT_ROTATION_6D]), object_features[:, OBJECT_POSITION])
+    body = Motion(time_s, rot6d_to_rotmat(body_features[:, OBJECT_ROTATION_6D]), body_features[:, OBJECT_POSITION])
     return Control(wrists, body, model, hinge)
 
 
@@ -122,6 +144,15 @@ def untracked_wrist(time_s: np.ndarray, object_m: np.ndarray) -> Motion:
     """A wrist out of range of all sensors, from object positions (frame, 3)."""
     position_m = object_m + np.array([UNTRACKED_DISTANCE_M, 0.0, 0.0])
     return Motion(time_s, np.tile(np.eye(3), (len(time_s), 1, 1)), position_m.astype(np.float64))
+
+
+def control_from_clip(clip: Clip) -> Control:
+    """Wrists and object of a recorded clip, world frame."""
+    axes, origin_m = np.eye(3), np.zeros(3)
+    tracks = [clip.hands[side] for side in SIDES]
+    wrists = np.stack([hand_features(track, axes, origin_m)[:, : GLOBAL_ORIENT_6D.stop] for track in tracks])
+    valid = np.stack([track.valid for track in tracks])
+    return control_of(Trajectories(wrists, valid, object_features(clip.object, axes, origin_m)), clip.object.model)
 
 
 def trajectories_of(sample: ClipSample) -> Trajectories:

@@ -141,7 +141,7 @@ NO_TRAJECTORIES = "this method needs trajectories of wrists and object, and the 
 class SamplingConfig:
     """The section ``sample.manipnet`` of params.yaml."""
 
-    rule: Rule = "ours"  # of post-processing; "off": the network's prediction
+    rule: Rule = "preset"  # of post-processing; "preset": that of the network's preset; "off": the network's prediction
 
 
 @dataclass(frozen=True)

@@ -49,12 +49,6 @@ def rotvecs_from_rest(hand: TrackedHand, finger_rotmats: np.ndarray) -> np.ndarr
     return mirror_rotvec_x(rotvec) if hand.side == "left" else rotvec
 
 
-def target_points(hand: TrackedHand) -> np.ndarray:
-    """(15,) points that post-processing moves: the last two joints and the tip of each finger."""
-    parents = hand.parents[hand.tip_joint]
-    return np.concatenate([np.sort(np.r_[parents, hand.tip_joint]), hand.n_joints + np.arange(len(parents))])
-
-
 def reach(
     hand: TrackedHand, limits: Limits, state: HandState, target_m: np.ndarray, weight: np.ndarray, steps: int = STEPS
 ) -> np.ndarray:
@@ -65,7 +59,7 @@ def reach(
         limits: of its joints.
         state: one frame, wrist frame.
         target_m: (point, 3) wrist frame, joints then tips.
-        weight: (point,) of the squared error; 0: no target.
+        weight: (point,) of the squared error; 0: no target. The wrist and the knuckles cannot move.
         steps: damped Gauss-Newton steps.
 
     Returns:
@@ -98,103 +92,62 @@ def _chains(hand: TrackedHand) -> np.ndarray:
 @njit(cache=True)
 def _reach(fingers, chains, offsets, tips, rest, low, high, target, weight, steps):  # pragma: no cover (compiled)
     """Finger rotations (joint - 1, 3, 3) after ``steps`` damped Gauss-Newton steps; arguments as of ``reach``."""
-    fingers, longest = fingers.copy(), chains.shape[1]
-    n_joints = len(fingers) + 1
+    fingers, longest, n_joints = fingers.copy(), chains.shape[1], len(fingers) + 1
     positions, rotations = np.empty((longest + 1, 3)), np.empty((longest, 3, 3))
-    matrix, vector, jacobian = np.empty((3 * longest, 3 * longest)), np.empty(3 * longest), np.empty((3, 3 * longest))
     for finger in range(len(chains)):
         chain, size = chains[finger], 0
         while size < longest and chain[size] > 0:
             size += 1
         for _ in range(steps):
-            _forward(fingers, chain, size, offsets, tips[finger], positions, rotations)
-            # Normal equations of this finger, (J^T W J + damping) x = J^T W error.
-            matrix[:], vector[:] = 0.0, 0.0
-            for index in range(3 * size):
-                matrix[index, index] = DAMPING_M2
+            # Forward kinematics of this finger, wrist frame, the tip last.
+            for index in range(size):
+                joint = chain[index]
+                if index == 0:
+                    positions[0], rotations[0] = offsets[joint], fingers[joint - 1]
+                else:
+                    positions[index] = positions[index - 1] + rotations[index - 1] @ offsets[joint]
+                    rotations[index] = _product(rotations[index - 1], fingers[joint - 1])
+            positions[size] = positions[size - 1] + rotations[size - 1] @ tips[finger]
+            # Normal equations, (J^T W J + damping) x = J^T W error.
+            matrix, vector = DAMPING_M2 * np.eye(3 * longest), np.zeros(3 * longest)
             for point in range(1, size + 1):
                 number = chain[point] if point < size else n_joints + finger  # joints, then the tip
                 if weight[number] > 0:
-                    _set_jacobian(jacobian, point, positions, rotations, low, high, chain)
-                    _add_point(matrix, vector, jacobian, 3 * point, weight[number], target[number], positions[point])
-            _solve(matrix, vector, 3 * size)
+                    jacobian = _jacobian(point, positions, rotations, low, high, chain)
+                    matrix += weight[number] * (jacobian.T @ jacobian)
+                    vector += weight[number] * (jacobian.T @ (target[number] - positions[point]))
+            change = np.linalg.solve(matrix, vector)
             for index in range(size):
                 joint = chain[index] - 1
                 # Rotate in the joint's local axes, then clamp the rotation from the neutral pose.
-                rotated = _product(fingers[joint], _exp(vector[3 * index : 3 * index + 3]))
+                rotated = _product(fingers[joint], _exp(change[3 * index : 3 * index + 3]))
                 from_rest = _log(_product(rest[joint].T, rotated))
-                for axis in range(3):
-                    from_rest[axis] = min(max(from_rest[axis], low[joint, axis]), high[joint, axis])
-                fingers[joint] = _product(rest[joint], _exp(from_rest))
+                fingers[joint] = _product(rest[joint], _exp(np.minimum(np.maximum(from_rest, low[joint]), high[joint])))
     return fingers
 
 
 @njit(cache=True)
 def _product(a, b):  # pragma: no cover (compiled)
-    """Product of two (3, 3) matrices."""
-    out = np.empty((3, 3))
+    """Product of two (3, 3) matrices, faster than BLAS."""
+    out = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
-            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+            for k in range(3):
+                out[i, j] += a[i, k] * b[k, j]
     return out
 
 
 @njit(cache=True)
-def _forward(fingers, chain, size, offsets, tip, positions, rotations):  # pragma: no cover (compiled)
-    """Forward kinematics of one finger, wrist frame: writes ``positions``, the tip last, and ``rotations``."""
-    for index in range(size + 1):
-        for axis in range(3):
-            if index == 0:
-                positions[0, axis] = offsets[chain[0], axis]
-            else:
-                offset, axis_row = offsets[chain[index]] if index < size else tip, rotations[index - 1, axis]
-                positions[index, axis] = (
-                    positions[index - 1, axis]
-                    + axis_row[0] * offset[0]
-                    + axis_row[1] * offset[1]
-                    + axis_row[2] * offset[2]
-                )
-        if index < size:
-            local = fingers[chain[index] - 1]
-            rotations[index] = local if index == 0 else _product(rotations[index - 1], local)
-
-
-@njit(cache=True)
-def _set_jacobian(jacobian, point, positions, rotations, low, high, chain):  # pragma: no cover (compiled)
-    """Jacobian of a point's position for small rotations of the joints before it; 0 for fixed axes."""
+def _jacobian(point, positions, rotations, low, high, chain):  # pragma: no cover (compiled)
+    """(3, 3 joints) of a point's position for small rotations of the joints before it; 0 for fixed axes."""
+    jacobian = np.zeros((3, 3 * len(chain)))
     for joint in range(point):
-        x, y, z = positions[point] - positions[joint]  # each column is the axis x the lever arm
+        (x, y, z), limits = positions[point] - positions[joint], chain[joint] - 1
         for axis in range(3):
-            column, axis_vector = 3 * joint + axis, rotations[joint, :, axis]
-            free = 1.0 if high[chain[joint] - 1, axis] > low[chain[joint] - 1, axis] else 0.0
-            jacobian[0, column] = free * (axis_vector[1] * z - axis_vector[2] * y)
-            jacobian[1, column] = free * (axis_vector[2] * x - axis_vector[0] * z)
-            jacobian[2, column] = free * (axis_vector[0] * y - axis_vector[1] * x)
-
-
-@njit(cache=True)
-def _add_point(matrix, vector, jacobian, size, weight, target, position):  # pragma: no cover (compiled)
-    """Add the term of a point to the normal equations."""
-    for i in range(size):
-        for axis in range(3):
-            vector[i] += weight * jacobian[axis, i] * (target[axis] - position[axis])
-            for j in range(size):
-                matrix[i, j] += weight * jacobian[axis, i] * jacobian[axis, j]
-
-
-@njit(cache=True)
-def _solve(matrix, vector, size):  # pragma: no cover (compiled)
-    """Solve in place by elimination without pivoting; the matrix is symmetric positive definite."""
-    for i in range(size):
-        for j in range(i + 1, size):
-            factor = matrix[j, i] / matrix[i, i]
-            for k in range(i, size):
-                matrix[j, k] -= factor * matrix[i, k]
-            vector[j] -= factor * vector[i]
-    for i in range(size - 1, -1, -1):
-        for k in range(i + 1, size):
-            vector[i] -= matrix[i, k] * vector[k]
-        vector[i] /= matrix[i, i]
+            if high[limits, axis] > low[limits, axis]:
+                a, b, c = rotations[joint, :, axis]  # the axis x the lever arm
+                jacobian[:, 3 * joint + axis] = b * z - c * y, c * x - a * z, a * y - b * x
+    return jacobian
 
 
 @njit(cache=True)
@@ -206,16 +159,8 @@ def _exp(rotvec):  # pragma: no cover (compiled)
     # Limits of sin(a) / a and (1 - cos(a)) / a^2 at 0.
     sine = np.sin(angle) / angle if angle > 1e-8 else 1.0
     versine = (1 - np.cos(angle)) / square if angle > 1e-4 else 0.5
-    out = np.empty((3, 3))
-    out[0, 0], out[1, 1], out[2, 2] = (
-        1 - versine * (y * y + z * z),
-        1 - versine * (x * x + z * z),
-        1 - versine * (x * x + y * y),
-    )
-    out[0, 1], out[1, 0] = versine * x * y - sine * z, versine * x * y + sine * z
-    out[0, 2], out[2, 0] = versine * x * z + sine * y, versine * x * z - sine * y
-    out[1, 2], out[2, 1] = versine * y * z - sine * x, versine * y * z + sine * x
-    return out
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + sine * skew + versine * _product(skew, skew)
 
 
 @njit(cache=True)

@@ -17,7 +17,7 @@ from models.manipnet.features import FeatureSettings
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Architecture; the defaults are the paper's."""
+    """Architecture; the defaults are the paper's, with sizes for the 17-joint hand and our features."""
 
     pose: int = 192  # numbers of each input and of the output
     trajectory: int = 336

@@ -20,7 +20,7 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.objects.user_mesh import UNITS_M
 from models.manipnet.control import Control, Motion, untracked_wrist
-from models.manipnet.trajectory_files import Body, TrajectoryFile
+from models.manipnet.trajectory_files import TrajectoryFile
 
 NEAR_M = 0.12  # from the palm centre to the object; a hand that never comes this close is not active
 PALM_M = 0.08  # from the wrist to the palm centre
@@ -33,14 +33,6 @@ PER_PALM_M, PER_SPREAD_M, PER_SPREAD_RAD = 10.0, 5.0, 0.5  # penalty per palm di
 MIN_SCORE, MIN_GAIN = -2.0, 0.3  # the best score is 2
 MIN_ALIGNMENT = 0.6
 MAX_CHECKED_FRAMES = 10_000  # longer files are thinned evenly
-
-
-class Fault(NamedTuple):
-    """A mistake in a file, as the arguments of a BadInput."""
-
-    expected: str
-    got: str
-    remedy: str
 
 
 class Fit(NamedTuple):
@@ -60,7 +52,7 @@ class Reading(NamedTuple):
     control: Control
     nearest_m: Mapping[Side, float]  # least distance of each palm from the object
     fits: Mapping[Side, Fit]
-    fault: Fault | None  # why it is implausible; None if it is plausible
+    fault: BadInput | None  # why it is implausible; None if it is plausible
 
     @property
     def active(self) -> list[Side]:
@@ -89,12 +81,12 @@ def plausible_reading(file: TrajectoryFile, model: ObjectModel, hands: Mapping[S
     if as_given.fault is None:
         # A plausible file is refused only if an alternative fits clearly better.
         if alternatives and alternatives[0][1].gain_over(as_given) > MIN_GAIN:
-            raise BadInput(file.source, *alternatives[0][0])
+            raise alternatives[0][0]
         return as_given
     scaled_readings = [(unit, reading(changed_file, model, hands)) for unit, changed_file in _other_units(file)]
     plausible_units = [unit for unit, scaled_reading in scaled_readings if scaled_reading.is_good]
     if alternatives and not plausible_units:
-        raise BadInput(file.source, *alternatives[0][0])
+        raise alternatives[0][0]
     remedy = as_given.fault.remedy
     if plausible_units:
         remedy = f"perhaps the positions have another unit: --trajectory-unit {' or '.join(plausible_units)}"
@@ -104,11 +96,12 @@ def plausible_reading(file: TrajectoryFile, model: ObjectModel, hands: Mapping[S
 def reading(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, TrackedHand]) -> Reading:
     """Read a file's trajectories with an object and measure their plausibility."""
     control = _control(file, model, hands)
-    thinned = _thinned(control)
+    time_s = control.object_motion.time_s
+    thinned = control.at(time_s[:: 1 + (len(time_s) - 1) // MAX_CHECKED_FRAMES])
     placed_hands: dict[Side, _PlacedHand] = {side: _PlacedHand(thinned, side, hands[side]) for side in file.wrists}
     nearest: dict[Side, float] = {side: float(placed.palm_distance_m.min()) for side, placed in placed_hands.items()}
     fits: dict[Side, Fit] = {side: placed.fit() for side, placed in placed_hands.items()}
-    return Reading(control, nearest, fits, _far(nearest) or _inside(placed_hands))
+    return Reading(control, nearest, fits, _far(file, nearest) or _inside(file, placed_hands))
 
 
 def _control(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, TrackedHand]) -> Control:
@@ -116,14 +109,14 @@ def _control(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, Trac
     object_body = file.object_body
     if file.at_box:
         middle = (model.vertices_m.min(axis=0) + model.vertices_m.max(axis=0)) / 2
-        object_body = Body(object_body.position_m - object_body.rotmats @ middle, object_body.rotmats)
+        object_body = replace(object_body, position_m=object_body.position_m - object_body.rotmats @ middle)
     wrists: dict[Side, Motion] = {
-        side: Motion(file.time_s, wrist.rotmats @ _file_from_model(file, hands[side]), wrist.position_m)
+        side: replace(wrist, rotmats=wrist.rotmats @ _file_from_model(file, hands[side]))
         for side, wrist in file.wrists.items()
     }
-    absent_wrist = untracked_wrist(file.time_s[:1], object_body.position_m[:1])
+    absent_wrist = untracked_wrist(object_body.time_s[:1], object_body.position_m[:1])
     both: dict[Side, Motion] = {side: wrists.get(side, absent_wrist) for side in SIDES}
-    return Control(both, Motion(file.time_s, object_body.rotmats, object_body.position_m), model, file.hinge_rad)
+    return Control(both, object_body, model, file.hinge_rad)
 
 
 def _file_from_model(file: TrajectoryFile, hand: TrackedHand) -> np.ndarray:
@@ -132,17 +125,6 @@ def _file_from_model(file: TrajectoryFile, hand: TrackedHand) -> np.ndarray:
         return np.eye(3)
     file_from_canonical = np.diag([-1.0 if hand.side == "left" else 1.0, 1.0, 1.0])
     return file_from_canonical @ hand.wrist_from_canonical.T
-
-
-def _thinned(control: Control) -> Control:
-    rows = slice(None, None, 1 + (len(control.object_motion.time_s) - 1) // MAX_CHECKED_FRAMES)
-
-    def thinned(motion: Motion) -> Motion:
-        return Motion(motion.time_s[rows], motion.rotmats[rows], motion.position_m[rows])
-
-    wrists: dict[Side, Motion] = {side: thinned(motion) for side, motion in control.wrists.items()}
-    hinge = None if control.hinge_rad is None else control.hinge_rad[rows]
-    return Control(wrists, thinned(control.object_motion), control.model, hinge)
 
 
 class _PlacedHand:
@@ -194,26 +176,31 @@ def _mean_cosine(directions: np.ndarray, vectors: np.ndarray) -> float:
     return float(((directions * vectors).sum(axis=1) / length).mean())
 
 
-def _far(nearest_m: Mapping[Side, float]) -> Fault | None:
+def _far(file: TrajectoryFile, nearest_m: Mapping[Side, float]) -> BadInput | None:
     if min(nearest_m.values()) < NEAR_M:
         return None
     got = ", ".join(f"the {side} one {metres:.3g} m" for side, metres in nearest_m.items())
-    return Fault(f"a palm that comes within {NEAR_M} m of the object", got, "check the positions and their unit")
+    return BadInput(
+        file.source, f"a palm that comes within {NEAR_M} m of the object", got, "check the positions and their unit"
+    )
 
 
-def _inside(placed_hands: Mapping[Side, _PlacedHand]) -> Fault | None:
+def _inside(file: TrajectoryFile, placed_hands: Mapping[Side, _PlacedHand]) -> BadInput | None:
     """The fault of a palm deep in the object, or a wrist in its convex hull, in most near frames."""
     for side, placed in placed_hands.items():
         if (fraction := placed.fraction_of_near(placed.palm_distance_m < -MAX_PALM_DEPTH_M)) > MAX_FRACTION:
             got = f"a {side} palm inside it in {100 * fraction:.0f} % of the frames in which it is near"
             remedy = "perhaps the mesh has another unit (--unit cm), or another origin than in the trajectories"
-            return Fault(f"{placed.control.model.name} outside of the hands", got, remedy)
+            return BadInput(file.source, f"{placed.control.model.name} outside of the hands", got, remedy)
         buried = placed.distance_m(_hull(placed.control.model)) < MIN_WRIST_DISTANCE_M
         if (fraction := placed.fraction_of_near(buried)) > MAX_FRACTION:
             got = f"a {side} wrist in it or closer in {100 * fraction:.0f} % of the frames in which the palm is near"
             remedy = "check the unit of the positions (--trajectory-unit) and of the mesh (--unit)"
-            return Fault(
-                f"a wrist at least {100 * MIN_WRIST_DISTANCE_M} cm off {placed.control.model.name}", got, remedy
+            return BadInput(
+                file.source,
+                f"a wrist at least {100 * MIN_WRIST_DISTANCE_M} cm off {placed.control.model.name}",
+                got,
+                remedy,
             )
     return None
 
@@ -239,24 +226,23 @@ def _hull_faces(model: ObjectModel, part: int) -> np.ndarray:
     return vertex_ids[simplices].astype(part_faces.dtype)
 
 
-def _other_conventions(file: TrajectoryFile) -> Iterator[tuple[Fault, TrajectoryFile]]:
+def _other_conventions(file: TrajectoryFile) -> Iterator[tuple[BadInput, TrajectoryFile]]:
     """The file with other wrist axes and with quaternions in the order x, y, z, w, each with the fault to report."""
     if file.unit:
         other = "model" if file.axes == "canonical" else "canonical"
         got = f"hands that fit the object only in the axes of --wrist-axes {other}"
-        fault = Fault(f"wrists in the axes of --wrist-axes {file.axes}", got, f"--wrist-axes {other}")
+        fault = BadInput(file.source, f"wrists in the axes of --wrist-axes {file.axes}", got, f"--wrist-axes {other}")
         yield fault, replace(file, axes=other)
-    wrists: dict[Side, Body] = {side: _reordered(body) for side, body in file.wrists.items()}
     got = "hands that fit the object only in the order x, y, z, w"
-    fault = Fault("quaternions in the order w, x, y, z", got, "put w first")
-    yield fault, replace(file, wrists=wrists, object_body=_reordered(file.object_body))
+    fault = BadInput(file.source, "quaternions in the order w, x, y, z", got, "put w first")
+    yield fault, file.with_bodies(_reordered)
 
 
-def _reordered(body: Body) -> Body:
+def _reordered(body: Motion) -> Motion:
     """The body if its quaternions are in the order x, y, z, w instead of w, x, y, z."""
     # SciPy's order is x, y, z, w.
     as_read = Rotation.from_matrix(body.rotmats).as_quat()[:, [3, 0, 1, 2]]
-    return Body(body.position_m, Rotation.from_quat(as_read).as_matrix())
+    return replace(body, rotmats=Rotation.from_quat(as_read).as_matrix())
 
 
 def _other_units(file: TrajectoryFile) -> Iterator[tuple[str, TrajectoryFile]]:
@@ -266,9 +252,4 @@ def _other_units(file: TrajectoryFile) -> Iterator[tuple[str, TrajectoryFile]]:
     # The ratio of each unit to the given one.
     factors = {unit: metres / UNITS_M[file.unit] for unit, metres in UNITS_M.items() if unit != file.unit}
     for unit, factor in sorted(factors.items(), key=lambda item: abs(np.log(item[1]))):
-        wrists: dict[Side, Body] = {side: _scaled(body, factor) for side, body in file.wrists.items()}
-        yield unit, replace(file, wrists=wrists, object_body=_scaled(file.object_body, factor))
-
-
-def _scaled(body: Body, factor: float) -> Body:
-    return Body(body.position_m * factor, body.rotmats)
+        yield unit, file.with_bodies(lambda body, factor=factor: replace(body, position_m=body.position_m * factor))

@@ -20,21 +20,23 @@ from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import HandState, TrackedHand
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
 from hoidata.sensors import sense
-from models.manipnet.control import Control, interpolate_rotations
+from models.manipnet.control import Control, interpolate_rotations, poses_at
 from models.manipnet.features import (
     FeatureSettings,
+    distance_offset_m,
     joint_rotmats_of,
     object_from_wrist,
     pose_features,
     trajectory_features,
 )
-from models.manipnet.inverse_kinematics import Limits, reach, target_points
+from models.manipnet.inverse_kinematics import Limits, reach
 from models.manipnet.network import ManipNet
 
-Rule = Literal["off", "paper", "ours"]
-# A point is active below this fraction of the distance range: the paper's 2.8 of 3.5 cm, the demo's 2.4 of 3 cm.
+Rule = Literal["preset", "off", "paper", "ours"]
+ACTIVE_M = 0.028  # Algorithm 1: a point is active up to this predicted distance
+# Our rule: a point is active below this fraction of the distance range, as in the release.
 ACTIVE_FRACTION = 0.8
-NEAR_M = 0.06  # as in the demo; without it, a wrong predicted distance pulls at a hand far from the object
+NEAR_M = 0.06  # as in the release; without it, a wrong predicted distance pulls at a hand far from the object
 # Our rule, chosen on the validation tenths of the real recordings. Their touching points are 4 to 8 mm deep in 5 %.
 MAX_INDENTATION_M = 0.008  # how far a finger may be indented by the object
 PRESS_M = 0.007  # target distance is the predicted one minus this
@@ -65,8 +67,8 @@ def paper_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndar
 
     Args:
         points_m: (..., point, 3) of the predicted pose.
-        predicted: (..., point) distances from the skin, as fractions of ``range_m``.
-        radius_m: (point,) from the point to the skin.
+        predicted: (..., point) output distances, as fractions of ``range_m``.
+        radius_m: (point,) see ``distance_offset_m``.
         range_m: see ``FeatureSettings``.
         nearest: the object's surface at ``points_m``.
 
@@ -77,7 +79,7 @@ def paper_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndar
     inside = nearest.distance_m < 0
     mixed_m = np.where(inside, 0.8 * distance_m + 0.2 * nearest.distance_m, 0.2 * distance_m + 0.8 * nearest.distance_m)
     target_m = nearest.closest_m + mixed_m[..., None] * nearest.normal
-    return Targets(np.where(_is_active(predicted, nearest)[..., None], target_m, points_m), np.ones(predicted.shape))
+    return Targets(np.where((distance_m <= ACTIVE_M)[..., None], target_m, points_m), np.ones(predicted.shape))
 
 
 def our_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarray, range_m: float,
@@ -92,8 +94,8 @@ def our_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarra
 
     Args:
         points_m: (point, 3) of the predicted pose.
-        predicted: (point,) distances from the skin, as fractions of ``range_m``.
-        radius_m: (point,) from the point to the skin.
+        predicted: (point,) output distances, as fractions of ``range_m``.
+        radius_m: (point,) see ``distance_offset_m``.
         range_m: see ``FeatureSettings``.
         is_near: (point,) bool, whether the predicted points are at the object or in it.
         thickness_m: (point,) radius of the finger at the point.
@@ -113,10 +115,6 @@ def our_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarra
     return Targets(target, np.where(enters, 1.0, np.maximum(confidence, MIN_WEIGHT)))
 
 
-def _is_active(predicted: np.ndarray, nearest: Nearest) -> np.ndarray:
-    return (predicted < ACTIVE_FRACTION) & (nearest.distance_m < NEAR_M)
-
-
 # Our rule: after solving, these passes move joints and capsules out that are deeper in the object than the limit.
 EXIT_PASSES, MAX_DEPTH_M = 4, 0.006
 # A capsule rotates about its joint, so its far end moves twice as far as its middle.
@@ -133,11 +131,15 @@ class Predictor:
     """A trained network with its post-processing."""
 
     network: ManipNet
-    rule: Rule = "ours"  # of post-processing
+    rule: Rule = "preset"  # of post-processing; "preset": that of the network's features
 
     @property
     def settings(self) -> FeatureSettings:
         return self.network.config.features
+
+    @property
+    def chosen_rule(self) -> Rule:
+        return self.settings.definition if self.rule == "preset" else self.rule
 
     def limits(self, hand: TrackedHand) -> Limits:
         """Joint limits of a hand: those of the training poses, and of its hinge joints."""
@@ -194,7 +196,8 @@ class HandRollout:
         transform = frame.object_from_wrist
         placed = RigidTransform(transform.rotation[None], transform.translation[None])
         sensed = sense(self.hand, self.state, placed, hinge, self.surface, self.predictor.settings.sensors)
-        return np.concatenate([pose_features(self.hand, self.state)[0], frame.trajectory, sensed.flat()[0]])
+        pose = pose_features(self.hand, self.state, self.predictor.settings)
+        return np.concatenate([pose[0], frame.trajectory, sensed.flat()[0]])
 
     def advance(self, output: np.ndarray, next_frame: FrameContext) -> None:
         """Go to the next frame with an output (214,) of the network, post-processed.
@@ -202,8 +205,8 @@ class HandRollout:
         With our rule the next input is the pose before post-processing: corrected poses are out of distribution, and
         the next prediction is worse.
         """
-        rule, previous_answer = self.predictor.rule, self.answer
-        fingers = self.hand.finger_rotmats(joint_rotmats_of(self.hand, output[None]))
+        rule, previous_answer = self.predictor.chosen_rule, self.answer
+        fingers = self.hand.finger_rotmats(joint_rotmats_of(self.hand, output[None], self.predictor.settings))
         self._set_pose(self.limits.within(fingers))
         if rule != "off":
             state = self._corrected(output, next_frame, previous_answer)
@@ -220,8 +223,8 @@ class HandRollout:
         hand, settings, points_m = self.hand, self.predictor.settings, self.state.point_m[0]
         predicted = np.clip(output[-hand.n_points :], 0, 1)
         nearest = self._nearest(points_m, next_frame)
-        shared = points_m, predicted, hand.point_radius_m, settings.range_m
-        if self.predictor.rule == "paper":
+        shared = points_m, predicted, distance_offset_m(hand, settings), settings.range_m
+        if self.predictor.chosen_rule == "paper":
             return self._solve(self.state, paper_targets(*shared, nearest))
         is_near = nearest.distance_m < self.thickness_m + AT_OBJECT_M
         state = self.hand.state(interpolate_rotations(previous_answer, self.finger_rotmats, np.full(1, BLEND_FRACTION)))
@@ -237,12 +240,7 @@ class HandRollout:
 
     def _solve(self, state: HandState, targets: Targets) -> HandState:
         """Solve inverse kinematics from a state."""
-        weight = np.zeros(self.hand.n_points)
-        movable = target_points(self.hand)
-        weight[movable] = targets.weight[movable]
-        if not weight.any():
-            return state
-        return self.hand.state(reach(self.hand, self.limits, state, targets.point_m, weight))
+        return self.hand.state(reach(self.hand, self.limits, state, targets.point_m, targets.weight))
 
     def _out_of_object(self, state: HandState, next_frame: FrameContext) -> Targets:
         """Targets of an exit pass: joints and capsules that are too deep in the object move out by the excess depth."""
@@ -282,7 +280,7 @@ class RolloutTask:
     hand: TrackedHand
     side: Side
     control: Control
-    time_s: np.ndarray  # (frame,) one step apart
+    time_s: np.ndarray  # (frame,) of the poses to return; the network's steps start at the first
     start: np.ndarray  # (joint - 1, 3, 3) finger rotations in the first frame
 
 
@@ -294,9 +292,14 @@ def roll_out(predictor: Predictor, tasks: Sequence[RolloutTask]) -> list[np.ndar
     Returns:
         Finger rotations (frame, joint - 1, 3, 3) of each task, with the start pose first.
     """
+    rate = 1 / predictor.settings.step_s
+    step_numbers = [(task.time_s - task.time_s[0]) * rate for task in tasks]  # of each task's frames, fractional
     contexts = [
-        [frame_context(task.control, task.side, task.hand, time_s, predictor.settings) for time_s in task.time_s]
-        for task in tasks
+        [
+            frame_context(task.control, task.side, task.hand, task.time_s[0] + step / rate, predictor.settings)
+            for step in range(int(np.ceil(numbers[-1] - 1e-6)) + 1)
+        ]
+        for task, numbers in zip(tasks, step_numbers, strict=True)
     ]
     rollouts = [HandRollout(predictor, task.hand, surface_index(task.control.model), task.start) for task in tasks]
     poses_by_task = [[rollout.answer[0]] for rollout in rollouts]
@@ -306,4 +309,4 @@ def roll_out(predictor: Predictor, tasks: Sequence[RolloutTask]) -> list[np.ndar
         for number, output in zip(running, predictor(inputs), strict=True):
             rollouts[number].advance(output, contexts[number][frame])
             poses_by_task[number].append(rollouts[number].answer[0])
-    return [np.stack(poses) for poses in poses_by_task]
+    return [poses_at(np.stack(poses), numbers) for poses, numbers in zip(poses_by_task, step_numbers, strict=True)]

@@ -1,29 +1,114 @@
-"""Fingers for a live tracker: the same results as for the whole clip, delayed by the network's look-ahead of 0.5 s."""
+"""Fingers for a live tracker, delayed by the network's look-ahead of 0.5 s; faults of the tracker never end a stream.
 
-from collections.abc import Mapping
+- A frame without a wrist or object, or with a pose that is not a finite rigid transform, is skipped for that body.
+  Gaps up to the look-ahead are interpolated. In a longer gap the hand keeps its fingers.
+- After such a gap or a jump, the body starts a new trajectory, as at the start of a recording, and the fingers are
+  blended from the kept to the predicted pose.
+- Frames that are not later than the one before are dropped. After ``MAX_LATE_FRAMES`` earlier ones, or a pause of more
+  than ``MAX_PAUSE_S``, the stream's clock continues from the new time.
+"""
+
+import operator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
 
-from hoidata.clips.clip import Side
+from hoidata.clips.clip import SIDES, Side
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
-from models.manipnet.control import Control, Motion
+from models.manipnet.control import Control, Motion, interpolate_rotations, untracked_wrist
+from models.manipnet.features import object_from_wrist
 from models.manipnet.rollout import FrameContext, HandRollout, Predictor, frame_context
 
 MARGIN_S = 0.25  # frames kept before the oldest trajectory sample, whose velocity needs the frame before it
+ROUNDING_S = 1e-6
+BLEND_S = 0.4
+MAX_SPEED_M_S = 10.0  # a faster body has jumped; recorded wrists reach 4 m/s
+MAX_LATE_FRAMES, MAX_PAUSE_S = 10, 5.0
+MAX_POSITION_M, ROTATION_TOLERANCE = 1e3, 1e-3  # of a usable pose; the tolerance is that of R R^T - I
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """One frame of a tracker."""
+    """One frame of a tracker; bodies may be missing, None or not finite."""
 
     time_s: float
-    wrists: Mapping[Side, RigidTransform]  # world_from_wrist
-    objects: Mapping[Side, RigidTransform]  # world_from_object of the object of each hand
+    wrists: Mapping[Side, RigidTransform | None]  # world_from_wrist
+    objects: Mapping[Side, RigidTransform | None]  # world_from_object of the object of each hand
     hinge_rad: Mapping[Side, float] | None = None  # of hinged objects
+
+
+class Sample(NamedTuple):
+    """One frame of one body."""
+
+    time_s: float
+    pose: RigidTransform
+    hinge_rad: float
+
+
+Trajectory = list[Sample]  # without jumps and without gaps longer than the look-ahead
+
+
+def is_usable(pose: RigidTransform | None) -> TypeGuard[RigidTransform]:
+    """Whether a tracked pose is finite, not absurdly far, and a proper rotation."""
+    if pose is None or not (np.isfinite(pose.rotation).all() and (np.abs(pose.translation) < MAX_POSITION_M).all()):
+        return False
+    error = np.abs(pose.rotation @ pose.rotation.T - np.eye(3)).max()
+    return bool(error < ROTATION_TOLERANCE and np.linalg.det(pose.rotation) > 0)
+
+
+def add_sample(trajectories: list[Trajectory], sample: Sample, max_gap_s: float) -> None:
+    """Append to the last trajectory; start a new one after a gap or jump."""
+    if trajectories:
+        last = trajectories[-1][-1]
+        elapsed_s, moved_m = (
+            sample.time_s - last.time_s,
+            np.linalg.norm(sample.pose.translation - last.pose.translation),
+        )
+        if elapsed_s <= max_gap_s and moved_m <= MAX_SPEED_M_S * elapsed_s:
+            trajectories[-1].append(sample)
+            return
+    trajectories.append([sample])
+
+
+def trajectory_at(trajectories: list[Trajectory], time_s: float) -> Trajectory:
+    """The last trajectory that has started at a time; empty if none has."""
+    return next((samples for samples in reversed(trajectories) if samples[0].time_s <= time_s), [])
+
+
+def motion_of(samples: Trajectory) -> Motion:
+    """A trajectory with interpolation."""
+    rotmats, position_m = (
+        np.stack([getattr(sample.pose, name) for sample in samples]) for name in ("rotation", "translation")
+    )
+    return Motion(np.array([sample.time_s for sample in samples]), rotmats, position_m)
+
+
+@dataclass
+class _HandStream:
+    """One hand of a stream."""
+
+    rollout: HandRollout
+    blend_start: np.ndarray  # (joint - 1, 3, 3) the pose from which to blend
+    blend_step: float  # increase of ``blended`` in a step
+    blended: float = 1.0  # weight of the predicted pose
+    trajectories: tuple[Trajectory, Trajectory] | None = None  # of wrist and object in the last step
+
+    @property
+    def pose(self) -> np.ndarray:
+        """(joint - 1, 3, 3) the pose to show."""
+        if self.blended >= 1:
+            return self.rollout.answer[0]
+        return interpolate_rotations(self.blend_start, self.rollout.answer[0], np.array([self.blended]))
+
+    def restart(self) -> None:
+        """Blend from the present pose."""
+        self.blend_start, self.blended = self.pose, 0.0
 
 
 class Stream:
@@ -34,7 +119,7 @@ class Stream:
 
     Args:
         predictor: the network.
-        hands: the hands to animate. Both wrists must be tracked.
+        hands: the hands to animate.
         models: the object of each hand.
         start: finger rotations (joint - 1, 3, 3) in the first frame.
     """
@@ -46,80 +131,126 @@ class Stream:
         models: Mapping[Side, ObjectModel],
         start: Mapping[Side, np.ndarray],
     ) -> None:
-        self.predictor, self.hands, self.models = predictor, hands, models
-        surfaces = {side: surface_index(models[side]) for side in hands}
-        self.rollouts: dict[Side, HandRollout] = {
-            side: HandRollout(predictor, hands[side], surfaces[side], start[side]) for side in hands
-        }
-        self.frames: list[TrackedFrame] = []
-        self.pose_count = 0
-        self.first_s = 0.0
+        self.predictor, self.hands, self.models = predictor, hands, dict(models)
         settings = predictor.settings
         read_s = [*settings.samples_s, *settings.sensors.times_s]  # relative to the present
         self._behind_s, self._ahead_s = -min(read_s), max(settings.step_s, *read_s)
+        surfaces = {side: surface_index(models[side]).prepare() for side in hands}
+        self._hands: dict[Side, _HandStream] = {
+            side: _HandStream(
+                HandRollout(predictor, hands[side], surfaces[side], start[side]), start[side], settings.step_s / BLEND_S
+            )
+            for side in hands
+        }
+        self._wrists: dict[Side, list[Trajectory]] = {side: [] for side in SIDES}
+        self._objects: dict[Side, list[Trajectory]] = {side: [] for side in hands}
+        self.pose_count, self.first_s, self._last_s = 0, -np.inf, -np.inf
+        self._clock_offset_s, self._late_frames = 0.0, 0
 
     def push(self, frame: TrackedFrame) -> list[dict[Side, np.ndarray]]:
         """Add a frame and return the poses that are now complete, by side (joint - 1, 3, 3): often none or several."""
-        self.first_s = frame.time_s if not self.frames else self.first_s
-        self.frames.append(frame)
-        return self._ready_poses(frame.time_s - self._ahead_s)
+        if not np.isfinite(frame.time_s) or not self._advance_clock(frame.time_s):
+            return []
+        for side in SIDES:
+            if is_usable(pose := frame.wrists.get(side)):
+                add_sample(self._wrists[side], Sample(self._last_s, pose, 0.0), self._ahead_s)
+        for side in self.hands:
+            angle = (frame.hinge_rad or {}).get(side, np.nan) if self.models[side].is_articulated else 0.0
+            if is_usable(pose := frame.objects.get(side)) and np.isfinite(angle):
+                add_sample(self._objects[side], Sample(self._last_s, pose, angle), self._ahead_s)
+        return list(self._ready_poses(self._last_s - self._ahead_s))
 
     def finish(self) -> list[dict[Side, np.ndarray]]:
         """End the stream: return the poses not yet returned, as if wrists and objects rested after the last frame."""
-        return self._ready_poses(np.inf)
+        return list(self._ready_poses(np.inf))
 
-    def _ready_poses(self, until_s: float) -> list[dict[Side, np.ndarray]]:
+    def exchange(self, side: Side, model: ObjectModel) -> None:
+        """Replace the object of a hand while the stream runs; its tracked pose now moves the new mesh."""
+        self.models[side], self._hands[side].rollout.surface = model, surface_index(model).prepare()
+        self._hands[side].restart()
+
+    def _advance_clock(self, time_s: float) -> bool:
+        """Set ``_last_s`` to the time of a frame; False for a frame to drop."""
+        if self._last_s == -np.inf:
+            self.first_s = self._last_s = time_s
+            return True
+        elapsed_s = time_s + self._clock_offset_s - self._last_s
+        if elapsed_s == 0 or (elapsed_s < 0 and self._late_frames < MAX_LATE_FRAMES):
+            self._late_frames += elapsed_s < 0
+            return False
+        if not 0 < elapsed_s <= MAX_PAUSE_S:  # count it as a pause that starts new trajectories
+            self._clock_offset_s += self._ahead_s + MARGIN_S - elapsed_s
+        self._last_s, self._late_frames = time_s + self._clock_offset_s, 0
+        return True
+
+    def _ready_poses(self, until_s: float) -> Iterator[dict[Side, np.ndarray]]:
         """Poses whose input, one step earlier, is before ``until_s``."""
-        poses = []
-        if self.pose_count == 0 and self.frames:
-            poses.append(self._poses())
-            self.pose_count = 1
+        if self.pose_count == 0 and self._last_s > -np.inf:
+            yield self._next_poses()
         while (
-            self._time_s(self.pose_count - 1) < until_s
-            and self._time_s(self.pose_count) <= self.frames[-1].time_s + 1e-6
+            self._time_s(self.pose_count - 1) < until_s and self._time_s(self.pose_count) <= self._last_s + ROUNDING_S
         ):
-            current = self._contexts(self._time_s(self.pose_count - 1))
-            # Post-processing reads only the present of the following frame; its future may not have arrived.
-            following = self._contexts(self._time_s(self.pose_count))
-            inputs = np.stack([self.rollouts[side].inputs(current[side]) for side in self.hands])
-            for side, output in zip(self.hands, self.predictor(inputs), strict=True):
-                self.rollouts[side].advance(output, following[side])
-            poses.append(self._poses())
-            self.pose_count += 1
-            self._discard_frames(self._time_s(self.pose_count - 1) - self._behind_s - MARGIN_S)
-        return poses
+            now_s, next_s = self._time_s(self.pose_count - 1), self._time_s(self.pose_count)
+            sides: list[Side] = [
+                side for side in self.hands if self._is_tracked(side, now_s) and self._is_tracked(side, next_s)
+            ]
+            inputs = [self._inputs(side, now_s) for side in sides]
+            outputs = self.predictor(np.stack(inputs)) if sides else []
+            for side, output in zip(sides, outputs, strict=True):
+                # Post-processing reads only the present of the following frame; its future may not have arrived.
+                control, settings = self._control(side, next_s), self.predictor.settings
+                transforms, hinge = object_from_wrist(control, side, np.array([next_s]), settings)
+                following = FrameContext(np.empty(0), transforms[0], None if hinge is None else hinge[0])
+                self._hands[side].rollout.advance(output, following)
+                self._hands[side].blended += self._hands[side].blend_step
+            yield self._next_poses()
+            for bodies in chain(self._wrists.values(), self._objects.values()):
+                _discard(bodies, now_s - self._behind_s - MARGIN_S)
 
     def _time_s(self, number: int) -> float:
         return self.first_s + number / (1 / self.predictor.settings.step_s)  # rounds like the times of clips
 
-    def _poses(self) -> dict[Side, np.ndarray]:
-        return {side: self.rollouts[side].answer[0] for side in self.hands}
+    def _next_poses(self) -> dict[Side, np.ndarray]:
+        self.pose_count += 1
+        return {side: hand.pose for side, hand in self._hands.items()}
 
-    def _contexts(self, time_s: float) -> dict[Side, FrameContext]:
-        settings = self.predictor.settings
-        return {
-            side: frame_context(self._control(side), side, hand, time_s, settings) for side, hand in self.hands.items()
+    def _trajectories(self, side: Side, time_s: float) -> tuple[Trajectory, Trajectory]:
+        """Those of a hand's wrist and object at a time; empty before they start."""
+        return trajectory_at(self._wrists[side], time_s), trajectory_at(self._objects[side], time_s)
+
+    def _is_tracked(self, side: Side, time_s: float) -> bool:
+        """Whether wrist and object are known at a time, recorded or interpolated."""
+        return all(body and time_s <= body[-1].time_s + ROUNDING_S for body in self._trajectories(side, time_s))
+
+    def _inputs(self, side: Side, time_s: float) -> np.ndarray:
+        """The network's input of a tracked hand."""
+        hand, bodies = self._hands[side], self._trajectories(side, time_s)
+        # In the first step the start pose is not blended.
+        if self.pose_count > 1 and not (hand.trajectories and all(map(operator.is_, bodies, hand.trajectories))):
+            hand.restart()
+        hand.trajectories, control = bodies, self._control(side, time_s)
+        return hand.rollout.inputs(frame_context(control, side, self.hands[side], time_s, self.predictor.settings))
+
+    def _control(self, side: Side, time_s: float) -> Control:
+        """Wrists and object of a tracked hand around a time."""
+        bodies = self._trajectories(side, time_s)
+        # Wrist and object rest after the end of either: one alone would move through the other.
+        stop_s = min(body[-1].time_s for body in bodies) + ROUNDING_S
+        wrist, samples = ([sample for sample in body if sample.time_s <= stop_s] for body in bodies)
+        body = motion_of(samples)
+        # The other wrist is interpolated over any gap: its distance then has no jump.
+        wrists: dict[Side, Motion] = {
+            other: motion_of(frames) if frames else untracked_wrist(body.time_s, body.position_m)
+            for other in SIDES
+            for frames in [wrist if other == side else list(chain(*self._wrists[other]))]
         }
-
-    def _control(self, side: Side) -> Control:
-        times = np.array([frame.time_s for frame in self.frames])
-        angles = [frame.hinge_rad for frame in self.frames]
-        hinge = None if not self.models[side].is_articulated else np.array([angle[side] for angle in angles if angle])
-        return Control(
-            {
-                wrist_side: _motion(times, [frame.wrists[wrist_side] for frame in self.frames])
-                for wrist_side in self.frames[0].wrists
-            },
-            _motion(times, [frame.objects[side] for frame in self.frames]),
-            self.models[side],
-            hinge,
-        )
-
-    def _discard_frames(self, before_s: float) -> None:
-        """Discard frames before a time, but keep the last one for interpolation."""
-        while len(self.frames) > 2 and self.frames[1].time_s < before_s:
-            self.frames.pop(0)
+        hinge_rad = np.array([sample.hinge_rad for sample in samples]) if self.models[side].is_articulated else None
+        return Control(wrists, body, self.models[side], hinge_rad)
 
 
-def _motion(times: np.ndarray, poses: list[RigidTransform]) -> Motion:
-    return Motion(times, np.stack([pose.rotation for pose in poses]), np.stack([pose.translation for pose in poses]))
+def _discard(trajectories: list[Trajectory], before_s: float) -> None:
+    """Discard what is before a time, but keep the last frame before it for interpolation."""
+    while len(trajectories) > 1 and trajectories[1][0].time_s < before_s:
+        trajectories.pop(0)
+    while trajectories and len(trajectories[0]) > 2 and trajectories[0][1].time_s < before_s:
+        trajectories[0].pop(0)

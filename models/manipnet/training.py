@@ -27,6 +27,7 @@ from models.manipnet.control import (
     finger_rotmats_of,
     hands_of,
     interpolate_rotations,
+    poses_at,
     trajectories_of,
 )
 from models.manipnet.features import FeatureSettings, hand_inputs, outputs, sizes, std_floors
@@ -41,7 +42,7 @@ MARGIN_RAD = 0.1  # joint limits are those of the training poses, extended by th
 class Examples(NamedTuple):
     """Training steps of one hand, each from a frame to the next."""
 
-    frame: np.ndarray  # (step,) the first frame
+    frame: np.ndarray  # (step,) the first frame, or the last frame of the clip before the step
     inputs: np.ndarray  # (step, 2350) float32
     outputs: np.ndarray  # (step, 214) float32
     rotvecs_rad: np.ndarray  # (step, joint - 1, 3) axis-angle from the neutral pose, as a right hand's
@@ -147,15 +148,19 @@ def clip_examples(
     """
     hands = hands_of(pair, sample.betas, sample.template_m)
     control, surface = control_of(trajectories_of(sample), sample.object_model), surface_index(sample.object_model)
-    time_s, examples = np.arange(sample.length) / FPS, []
+    clip_frame = np.arange(int((sample.length - 1) / (FPS * settings.step_s) + 1e-6) + 1) * settings.step_s * FPS
+    frames = np.floor(clip_frame + 1e-6).astype(int), np.ceil(clip_frame - 1e-6).astype(int)
+    time_s, examples = clip_frame / FPS, []
     for side_index, side in enumerate(SIDES):
         if not has_steps(sample)[side_index]:
             continue
-        hand, fingers = hands[side], finger_rotmats_of(sample.hands[side_index])
+        hand, fingers = hands[side], poses_at(finger_rotmats_of(sample.hands[side_index]), clip_frame)
+        usable = sample.valid[side_index][frames[0]] & sample.valid[side_index][frames[1]]
         seed = int.from_bytes(sha256(f"{sample.clip_id} {side}".encode()).digest()[:7])
         start_rotmats = None if pool is None else perturbed_poses(fingers, mirrored_to_right(hand, pool), seed)
-        arguments = (control, side, hand, fingers, time_s, sample.valid[side_index], surface, settings, start_rotmats)
-        examples.append(hand_examples(*arguments))
+        arguments = (control, side, hand, fingers, time_s, usable, surface, settings, start_rotmats)
+        steps = hand_examples(*arguments)
+        examples.append(steps._replace(frame=frames[0][steps.frame]))
     return examples
 
 
@@ -182,7 +187,7 @@ class FingersObjective:
 
     def __init__(self, setup: Setup) -> None:
         pair, self.loss, self.device = setup.corpus.annotated.store.hand_pair(), setup.loss, setup.device
-        settings = replace(setup.network.features, step_s=1 / FPS)
+        settings = setup.network.features
         train = setup.corpus.train
         clips = [train.whole(clip_id) for clip_id in train.ids]
         pools = (None, pose_pool(clips, pair)) if self.loss.perturbed_fraction else (None,)
@@ -193,7 +198,7 @@ class FingersObjective:
         }
         hand = hands_of(pair, clips[0].betas, clips[0].template_m)["right"]
         examples = [example for clip in self.examples.values() for kinds in clip for example in kinds]
-        self.network = build_network(replace(setup.network, features=settings), hand, examples).to(setup.device)
+        self.network = build_network(setup.network, hand, examples).to(setup.device)
         validation = [example for sample in setup.corpus.held_out for example in clip_examples(sample, pair, settings)]
         if setup.corpus.held_out and not validation:
             expected = "a hand that is tracked in two consecutive frames"

@@ -13,7 +13,7 @@ decimetres with y up; the object's position is the centre of its bounding box.
 
 import csv
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -26,6 +26,7 @@ from hoidata.clips.clip import SIDES, Side
 from hoidata.errors import BadInput
 from hoidata.files.numpy_files import load_npz_arrays
 from hoidata.objects.user_mesh import UNITS_M
+from models.manipnet.control import Motion
 
 Axes = Literal["model", "canonical"]
 BODIES = ("object", *SIDES)
@@ -40,27 +41,22 @@ _MIRROR_POSITION, _MIRROR_QUATERNION = np.array([-1.0, 1, 1]), np.array([1.0, 1,
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
-    """The motion of one body."""
-
-    position_m: np.ndarray  # (frame, 3)
-    rotmats: np.ndarray  # (frame, 3, 3) world_from_body
-
-
-@dataclass(frozen=True, eq=False)
 class TrajectoryFile:
     """The content of a trajectory file."""
 
     source: str  # its name, for errors
-    time_s: np.ndarray  # (frame,)
-    wrists: Mapping[Side, Body]  # one or both
-    object_body: Body
+    wrists: Mapping[Side, Motion]  # one or both
+    object_body: Motion
     hinge_rad: np.ndarray | None = None  # (frame,)
     axes: Axes = "model"  # of the wrists
     at_box: bool = False  # whether the object's position is the centre of its bounding box
     up: tuple[float, float, float] | None = None  # of the world; None if the format does not define it
     mesh_unit: str = ""  # of the meshes that belong to this format
     unit: str = "m"  # of the positions as given by the user; "" if the format defines unit and axes
+
+    def with_bodies(self, change: Callable[[Motion], Motion]) -> "TrajectoryFile":
+        wrists: dict[Side, Motion] = {side: change(body) for side, body in self.wrists.items()}
+        return replace(self, wrists=wrists, object_body=change(self.object_body))
 
 
 def read_trajectories(path: Path, unit: str = "", axes: Axes = "model") -> TrajectoryFile:
@@ -136,14 +132,12 @@ def from_arrays(arrays: Mapping[str, np.ndarray], source: str, unit: str = "m") 
     time_s = _array(arrays, "time_s", (), source)
     _check_times(time_s, source)
     sides: list[Side] = [side for side in SIDES if f"{side}_position" in arrays]
-    wrists: dict[Side, Body] = {side: _body(arrays, side, len(time_s), source, UNITS_M[unit]) for side in sides}
+    wrists: dict[Side, Motion] = {side: _body(arrays, side, time_s, source, UNITS_M[unit]) for side in sides}
     if not wrists:
         raise BadInput(source, "the wrist of a hand, left or right", "neither", "add left_... or right_...")
-    object_body = _body(arrays, "object", len(time_s), source, UNITS_M[unit])
+    object_body = _body(arrays, "object", time_s, source, UNITS_M[unit])
     hinge = _array(arrays, "hinge_rad", (), source, len(time_s)) if "hinge_rad" in arrays else None
-    return TrajectoryFile(
-        source=source, time_s=time_s, wrists=wrists, object_body=object_body, hinge_rad=hinge, unit=unit
-    )
+    return TrajectoryFile(source=source, wrists=wrists, object_body=object_body, hinge_rad=hinge, unit=unit)
 
 
 def parse_manipnet(data: bytes, source: str) -> TrajectoryFile:
@@ -222,12 +216,12 @@ def _check_times(time_s: np.ndarray, source: str) -> None:
         )
 
 
-def _body(arrays: Mapping[str, np.ndarray], body: str, count: int, source: str, unit_m: float) -> Body:
-    position = _array(arrays, f"{body}_position", (3,), source, count)
-    quaternion = _array(arrays, f"{body}_quaternion", (4,), source, count)
+def _body(arrays: Mapping[str, np.ndarray], body: str, time_s: np.ndarray, source: str, unit_m: float) -> Motion:
+    position = _array(arrays, f"{body}_position", (3,), source, len(time_s))
+    quaternion = _array(arrays, f"{body}_quaternion", (4,), source, len(time_s))
     length = np.linalg.norm(quaternion, axis=1)
     if np.abs(length - 1).max() > 0.01:
         row_number = int(np.abs(length - 1).argmax())
         got = f"one of length {length[row_number]:.3g} in row {row_number + 1}"
         raise BadInput(f"{source}: {body}", "quaternions of length 1", got, "write w, x, y, z of a rotation")
-    return Body(position * unit_m, Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_matrix())
+    return Motion(time_s, Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_matrix(), position * unit_m)

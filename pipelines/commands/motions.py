@@ -195,9 +195,9 @@ def animate(
         typer.Option(help="Dataset whose network to use. Default: the clip's dataset, else the first with a network."),
     ] = "",
     rule: Annotated[
-        Literal["ours", "paper", "off"],
-        typer.Option(help="Post-processing of predicted fingers: ours, paper (as in ManipNet), or off."),
-    ] = "ours",
+        Literal["preset", "ours", "paper", "off"],
+        typer.Option(help="Post-processing of predicted fingers: preset (the network's), ours, paper, off."),
+    ] = "preset",
     trajectory_unit: Annotated[
         str, typer.Option(help="Unit of positions in .csv and .npz files: m, cm, mm, dm or inch. Default: m.")
     ] = "",

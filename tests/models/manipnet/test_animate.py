@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from hoidata.clips.clip import HandTrack
-from models.manipnet.animate import control_from_clip, gap_of, interpolate_fingers, with_fingers
+from models.manipnet.animate import gap_of, interpolate_fingers, with_fingers
+from models.manipnet.control import control_from_clip
 from tests.builders.clips import build_clip, random_hand, with_hand
 
 FRAMES = 40

@@ -25,7 +25,8 @@ from tests.builders.sensing import random_rotations, small_hand
 
 MIRROR = np.diag([-1.0, 1.0, 1.0])
 RATE = 60
-SETTINGS = FeatureSettings()
+SETTINGS = FeatureSettings(step_s=1 / RATE)
+PAPER = FeatureSettings(definition="paper", step_s=1 / RATE)
 
 
 def wandering(seed: int, frames: int = 120) -> Motion:
@@ -60,22 +61,24 @@ def mirrored_scene(scene: Control) -> Control:
 HANDS = {"small": small_hand(), "mano": mano_hand(load_embedded_hands(), "right")}
 
 
+@pytest.mark.parametrize("settings", [SETTINGS, PAPER], ids=["ours", "paper"])
 @pytest.mark.parametrize("hand", HANDS.values(), ids=HANDS)
-def test_joint_rotations_are_recovered_from_the_features_of_either_hand(hand: TrackedHand):
+def test_joint_rotations_are_recovered_from_the_features_of_either_hand(hand: TrackedHand, settings: FeatureSettings):
     for one_hand in (hand, hand.mirrored()):
         state = one_hand.state(random_rotations(5 * (hand.n_joints - 1), 0.5, 0).reshape(5, -1, 3, 3))
-        rotmats = joint_rotmats_of(one_hand, pose_features(one_hand, state))
+        rotmats = joint_rotmats_of(one_hand, pose_features(one_hand, state, settings), settings)
         np.testing.assert_allclose(rotmats, state.joint_rotmats, atol=1e-12)
-        noisy = pose_features(one_hand, state) + np.random.default_rng(0).normal(0, 0.1, (5, 1))
-        from_noisy = joint_rotmats_of(one_hand, noisy)
+        noisy = pose_features(one_hand, state, settings) + np.random.default_rng(0).normal(0, 0.1, (5, 1))
+        from_noisy = joint_rotmats_of(one_hand, noisy, settings)
         np.testing.assert_allclose(
             from_noisy @ from_noisy.swapaxes(-1, -2), np.broadcast_to(np.eye(3), from_noisy.shape), atol=1e-12
         )
         np.testing.assert_allclose(np.linalg.det(from_noisy), 1)
 
 
-def test_inputs_are_unchanged_when_the_scene_moves_or_is_mirrored_with_the_hand():
-    scene, hand, time_s, settings = control(), small_hand(), np.array([0.7, 0.71, 1.3]), SETTINGS
+@pytest.mark.parametrize("settings", [SETTINGS, PAPER], ids=["ours", "paper"])
+def test_inputs_are_unchanged_when_the_scene_moves_or_is_mirrored_with_the_hand(settings: FeatureSettings):
+    scene, hand, time_s = control(), small_hand(), np.array([0.7, 0.71, 1.3])
     poses = random_rotations(3 * 5, 0.3, 4).reshape(3, 5, 3, 3)
     surface = SurfaceIndex(scene.model)
     original = hand_inputs(scene, "right", hand, hand.state(poses), time_s, surface, settings)
@@ -121,7 +124,7 @@ def test_motion_is_interpolated_evenly_and_constant_beyond_its_ends():
 
 
 def test_a_short_trajectory_has_fewer_samples_and_fewer_sensed_times():
-    short = FeatureSettings(future_s=0.1, sensors=replace(SETTINGS.sensors, times_s=(0.0, 0.1)))
+    short = FeatureSettings(future_s=0.1)
     hand, scene = small_hand(), control()
     inputs = hand_inputs(
         scene, "right", hand, hand.state(hand.rest_rotmats[None]), np.array([1.0]), SurfaceIndex(scene.model), short
@@ -135,5 +138,10 @@ def test_output_distances_are_fractions_of_3_cm_from_the_capsule():
     distance_m = np.tile([-0.01, 0.01, 0.025, 0.04, 0.05, 0.1, 0.0, 0.015, 0.03, 0.06, 0.1], (1, 1))
     fractions = output_distances(hand, distance_m, SETTINGS)[0]
     np.testing.assert_allclose(fractions, [0, 0, 0.5, 1, 1, 1, 0, 0.5, 1, 1, 1])
-    wide = output_distances(hand, distance_m, replace(SETTINGS, range_m=0.06))[0]
-    np.testing.assert_allclose(wide[:4], [0, 0, 0.25, 0.5])
+
+
+def test_the_papers_output_distances_are_fractions_of_3_5_cm_from_the_joint():
+    hand = small_hand()
+    distance_m = np.tile([-0.01, 0.007, 0.0175, 0.028, 0.035, 0.1, 0.0, 0.007, 0.014, 0.035, 0.04], (1, 1))
+    fractions = output_distances(hand, distance_m, PAPER)[0]
+    np.testing.assert_allclose(fractions, [0, 0.2, 0.5, 0.8, 1, 1, 0, 0.2, 0.4, 1, 1])

@@ -27,7 +27,7 @@ from models.manipnet.animate import Gap, predict_fingers
 from models.manipnet.control import control_of, finger_rotmats_of, hands_of, trajectories_of
 from models.manipnet.family import FingerSampler, diagnose, recorded_hands, thinned
 from models.manipnet.features import FeatureSettings, outputs, pose_features
-from models.manipnet.inverse_kinematics import Limits, reach, target_points
+from models.manipnet.inverse_kinematics import Limits, reach
 from models.manipnet.network import ManipNet, NetworkConfig
 from models.manipnet.retrieval import mirrored_to_right
 from models.manipnet.rollout import (
@@ -241,11 +241,10 @@ def test_an_object_in_each_hand_is_sensed_by_that_hand(fingers: FingerSampler, s
 def test_joints_reach_the_points_of_another_pose_and_stop_at_their_limits() -> None:
     hand = right_hand()
     start, goal = hand.state(hand.rest_rotmats[None]), hand.state(perturbed_pose(hand, 0.2))
-    weight = np.zeros(hand.n_points)
-    weight[target_points(hand)] = 1
-    before = np.linalg.norm(start.point_m - goal.point_m, axis=-1)[0, target_points(hand)]
+    weight = np.ones(hand.n_points)
+    before = np.linalg.norm(start.point_m - goal.point_m, axis=-1)[0]
     reached = hand.state(reach(hand, free(hand), start, goal.point_m[0], weight, steps=12))
-    after = np.linalg.norm(reached.point_m - goal.point_m, axis=-1)[0, target_points(hand)]
+    after = np.linalg.norm(reached.point_m - goal.point_m, axis=-1)[0]
     assert after.max() < 0.002 < 0.005 < before.max()
     tight = free(hand, 0.05)
     stopped = reach(hand, tight, start, goal.point_m[0], weight, steps=12)
@@ -305,7 +304,7 @@ def test_our_rule_moves_fingers_out_of_the_object_and_keeps_the_predicted_pose_a
     model = ObjectModel("box", np.array(mesh.vertices), np.array(mesh.faces), np.zeros(8, np.uint8))
     network, surface = ManipNet(sized_config(NetworkConfig(encoder=8), hand)).eval(), surface_index(model)
     state = hand.state(hand.rest_rotmats[None])
-    output = np.concatenate([pose_features(hand, state)[0], np.zeros(hand.n_points)])
+    output = np.concatenate([pose_features(hand, state, FeatureSettings())[0], np.zeros(hand.n_points)])
     object_from_wrist = RigidTransform(
         np.eye(3)[None], -state.tip_m[:, 1]
     )  # the box surrounds the tip of the middle finger

@@ -1,4 +1,6 @@
-"""A stream gives the poses of the whole clip, at any tracker rate, as soon as the network's inputs have arrived."""
+"""A stream gives the poses of the whole clip as soon as the network's inputs have arrived, and survives a tracker."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from models.manipnet.features import FeatureSettings
 from models.manipnet.network import NetworkConfig
 from models.manipnet.rollout import Predictor, RolloutTask, roll_out
 from models.manipnet.stream import Stream, TrackedFrame
-from models.manipnet.training import build_network, hand_examples
+from models.manipnet.training import NETWORK_ARRAYS, build_network, hand_examples, perturbed_poses, step_loss
 from tests.builders.objects import box_model
 
 HANDS: dict[Side, TrackedHand] = {side: mano_hand(load_embedded_hands(), side) for side in SIDES}
@@ -57,13 +59,28 @@ def predictor(step_s: float) -> Predictor:
 
 def streamed(model: Predictor, control: Control) -> tuple[list[dict[Side, np.ndarray]], list[float]]:
     """The poses of a stream, and for each that ``push`` returned the time of the pushed frame."""
-    stream, poses, when_s = Stream(model, HANDS, dict.fromkeys(SIDES, BOX), START), [], []
-    for number, now_s in enumerate(control.object_motion.time_s):
-        wrists: dict[Side, RigidTransform] = {side: frame(motion, number) for side, motion in control.wrists.items()}
-        new_poses = stream.push(TrackedFrame(now_s, wrists, dict.fromkeys(SIDES, frame(control.object_motion, number))))
+    stream, poses, when_s = new_stream(model), [], []
+    for tracked_frame in frames_of(control):
+        new_poses = stream.push(tracked_frame)
         poses += new_poses
-        when_s += [now_s] * len(new_poses)
+        when_s += [tracked_frame.time_s] * len(new_poses)
     return poses + stream.finish(), when_s
+
+
+def new_stream(model: Predictor) -> Stream:
+    return Stream(model, HANDS, dict.fromkeys(SIDES, BOX), START)
+
+
+def frames_of(control: Control) -> list[TrackedFrame]:
+    """The frames of a tracker without faults."""
+    return [
+        TrackedFrame(
+            float(now_s),
+            {side: frame(motion, number) for side, motion in control.wrists.items()},
+            dict.fromkeys(SIDES, frame(control.object_motion, number)),
+        )
+        for number, now_s in enumerate(control.object_motion.time_s)
+    ]
 
 
 def frame(motion: Motion, number: int) -> RigidTransform:
@@ -117,3 +134,183 @@ def test_a_stream_returns_a_pose_as_soon_as_its_inputs_have_arrived():
     waited = [when - (number - 1) / 60 for number, when in enumerate(when_s) if number]
     assert max(waited) <= ahead_s + 1 / 60 + 1e-6
     assert min(waited) > ahead_s - 1e-6
+
+
+STEP_HZ, TRACKER_HZ = 30, 60
+
+
+@pytest.fixture(scope="module")
+def trained() -> Predictor:
+    """A network that follows smooth fingers, from recorded and from perturbed poses; an untrained one is not steady."""
+    torch.manual_seed(0)
+    settings, control, time_s = FeatureSettings(step_s=1 / STEP_HZ), tracked(STEP_HZ, 8.0), np.arange(241) / STEP_HZ
+    usable, surface, examples = np.ones(241, bool), surface_index(BOX), []
+    for number, (side, hand) in enumerate(HANDS.items()):
+        bend = np.stack([waves(10 * number + joint, time_s, 0.3) for joint in range(15)], axis=1)
+        fingers = hand.rest_rotmats @ rotvec_to_rotmat(bend)
+        for start in (None, perturbed_poses(fingers, fingers, number)):
+            examples.append(hand_examples(control, side, hand, fingers, time_s, usable, surface, settings, start))
+    network = build_network(NetworkConfig(encoder=32, features=settings), HANDS["right"], examples)
+    inputs, targets = (
+        torch.from_numpy(np.concatenate([getattr(example, name) for example in examples])) for name in NETWORK_ARRAYS
+    )
+    optimiser = torch.optim.Adam(network.parameters(), 2e-3)
+    for _ in range(150):
+        optimiser.zero_grad()
+        step_loss(network, inputs, targets).backward()
+        optimiser.step()
+    return Predictor(network.eval())
+
+
+NAN = RigidTransform(np.full((3, 3), np.nan), np.full(3, np.nan))
+SHEARED = RigidTransform(np.diag([1.0, 1, 3]), np.zeros(3))
+AWAY_M = np.array([0.3, 0.0, 0.0])
+KINDS = ("wrist", "repeated", "elsewhere", "nan", "sheared", "object", "frames", "time", "late")
+
+
+def with_fault(frames: list[TrackedFrame | None], kind: str, side: Side, faulty: slice) -> None:
+    """Put a fault into some frames, in place; None: no frame arrives."""
+    first = faulty.start
+    if kind == "late":
+        frames[first], frames[first + 3] = frames[first + 3], frames[first]
+    for number in range(len(frames))[faulty]:
+        one = frames[number]
+        if one is None:
+            continue
+        wrist = one.wrists[side]
+        assert wrist is not None
+        changed: dict[str, RigidTransform | None] = {
+            "wrist": None,
+            "nan": NAN,
+            "sheared": SHEARED,
+            "elsewhere": RigidTransform(wrist.rotation, wrist.translation + AWAY_M),
+        }
+        if kind in changed:
+            frames[number] = replace(one, wrists={**one.wrists, side: changed[kind]})
+        elif kind == "object":
+            frames[number] = replace(one, objects={})
+        elif kind == "frames":
+            frames[number] = None
+        elif kind == "time":
+            frames[number] = replace(one, time_s=float("nan"))
+        elif kind == "repeated":
+            frames[number] = replace(one, time_s=(first - 1) / TRACKER_HZ)
+
+
+def poses_with_faults(
+    model: Predictor, control: Control, faults: list[tuple[str, Side, slice]]
+) -> list[dict[Side, np.ndarray]]:
+    frames: list[TrackedFrame | None] = [*frames_of(control)]
+    for kind, side, faulty in faults:
+        with_fault(frames, kind, side, faulty)
+    stream = new_stream(model)
+    poses = [pose for one in frames if one is not None for pose in stream.push(one)]
+    return poses + stream.finish()
+
+
+def random_faults(seed: int, length_s: float) -> list[tuple[str, Side, slice]]:
+    """Faults of 1 frame to 1.5 s, at least 1.5 s apart."""
+    rng, faults, now_s = np.random.default_rng(seed), [], 1.0
+    while now_s < length_s - 2.0:
+        long_s = float(rng.choice([1 / TRACKER_HZ, 0.1, 0.4, 0.7, 1.5]))
+        first = round(now_s * TRACKER_HZ)
+        faulty = slice(first, first + round(long_s * TRACKER_HZ))
+        faults.append((str(rng.choice(KINDS)), SIDES[rng.integers(2)], faulty))
+        now_s += long_s + float(rng.uniform(1.5, 2.5))
+    return faults
+
+
+def points_m(side: Side, poses: list[dict[Side, np.ndarray]]) -> np.ndarray:
+    """(frame, point, 3) joints and tips, wrist frame."""
+    return HANDS[side].state(np.stack([pose[side] for pose in poses])).point_m
+
+
+def largest_step_m(points: np.ndarray) -> float:
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=-1).max())
+
+
+def assert_survived(
+    whole: list[dict[Side, np.ndarray]], poses: list[dict[Side, np.ndarray]], faults: list[tuple[str, Side, slice]]
+) -> None:
+    """All poses are there; none jumps more than without faults (``whole``); 0.5 s after a fault they are like those."""
+    assert len(poses) == len(whole)
+    time_s, away = np.arange(len(whole)) / STEP_HZ, np.ones(len(whole), bool)
+    for _, _, faulty in faults:
+        # The look-ahead reads a fault 0.5 s before it.
+        away &= ~((time_s > faulty.start / TRACKER_HZ - 0.55) & (time_s < (faulty.stop + 3) / TRACKER_HZ + 0.5))
+    for side in SIDES:
+        expected, got = points_m(side, whole), points_m(side, poses)
+        assert np.isfinite(got).all()
+        assert largest_step_m(got) < 1.2 * largest_step_m(expected)
+        assert np.linalg.norm(got - expected, axis=-1).mean(axis=1)[away].max() < 0.008
+
+
+@pytest.fixture(scope="module")
+def whole(trained: Predictor) -> list[dict[Side, np.ndarray]]:
+    """The poses of three seconds without faults."""
+    return streamed(trained, tracked(TRACKER_HZ, 3.0))[0]
+
+
+@pytest.mark.parametrize(
+    "kind", [kind if kind in KINDS[:3] else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
+)
+def test_a_stream_survives_each_fault_and_recovers_within_half_a_second(trained: Predictor, whole, kind: str) -> None:
+    faults: list[tuple[str, Side, slice]] = [(kind, "right", slice(30, 34)), (kind, "left", slice(75, 118))]
+    assert_survived(whole, poses_with_faults(trained, tracked(TRACKER_HZ, 3.0), faults), faults)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("length_s", [30.0, 1800.0])
+def test_a_stream_survives_random_faults(trained: Predictor, length_s: float) -> None:
+    control, faults = tracked(TRACKER_HZ, length_s), random_faults(0, length_s)
+    assert_survived(streamed(trained, control)[0], poses_with_faults(trained, control, faults), faults)
+
+
+def test_lost_fingers_are_kept_and_the_other_hand_goes_on(trained: Predictor) -> None:
+    faults: list[tuple[str, Side, slice]] = [("wrist", "left", slice(60, 120))]
+    poses = poses_with_faults(trained, tracked(TRACKER_HZ, 2.5), faults)
+    left = np.stack([pose["left"] for pose in poses])
+    np.testing.assert_array_equal(left[31:60], np.repeat(left[30:31], 29, axis=0))
+    steps = np.linalg.norm(np.diff(points_m("right", poses)[31:60], axis=0), axis=-1).max(axis=1)
+    assert steps.min() > 1e-4
+
+
+def test_one_tracked_hand_gets_fingers_and_the_other_keeps_its_pose(trained: Predictor) -> None:
+    control, stream = tracked(TRACKER_HZ, 1.5), new_stream(trained)
+    for one in frames_of(control):
+        stream.push(replace(one, wrists={"right": one.wrists["right"]}, objects={"right": one.objects["right"]}))
+    poses = stream.finish()
+    assert all(np.array_equal(pose["left"], START["left"]) for pose in poses)
+    assert largest_step_m(points_m("right", poses)) > 1e-3
+
+
+def test_a_hand_that_appears_later_is_blended_from_its_start_pose(trained: Predictor) -> None:
+    faults: list[tuple[str, Side, slice]] = [("wrist", "left", slice(0, 60))]
+    poses = poses_with_faults(trained, tracked(TRACKER_HZ, 3.0), faults)
+    left = points_m("left", poses)
+    assert largest_step_m(left[:31]) == 0
+    apart_m = np.linalg.norm(left - left[0], axis=-1).max(axis=1)
+    assert 0 < apart_m[31] < 0.2 * apart_m.max()
+
+
+@pytest.mark.parametrize("jump_s", [-2.0, 1e6])
+def test_a_clock_that_is_set_delays_the_stream_by_a_moment_only(trained: Predictor, jump_s: float) -> None:
+    control, stream, count = tracked(TRACKER_HZ, 4.0), new_stream(trained), 0
+    for number, one in enumerate(frames_of(control)):
+        count += len(stream.push(replace(one, time_s=one.time_s + jump_s * (number >= 120))))
+    # The clock continues after a pause of 0.75 s; up to 10 frames are dropped as late.
+    assert abs(count + len(stream.finish()) - STEP_HZ * 4.75) <= 6
+
+
+def test_an_exchanged_object_is_sensed_and_the_fingers_do_not_jump(trained: Predictor) -> None:
+    control, poses = tracked(TRACKER_HZ, 4.0), {}
+    for exchanged in (False, True):
+        stream, poses[exchanged] = new_stream(trained), []
+        for number, one in enumerate(frames_of(control)):
+            if exchanged and number == 120:
+                stream.exchange("right", box_model((0.02, 0.02, 0.3)))
+            poses[exchanged] += stream.push(one)
+    same, other = points_m("right", poses[False]), points_m("right", poses[True])
+    np.testing.assert_array_equal(same[:46], other[:46])
+    assert np.linalg.norm(same - other, axis=-1)[70:].max() > 0.001
+    assert largest_step_m(other) < 1.2 * largest_step_m(same)

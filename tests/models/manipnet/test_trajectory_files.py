@@ -87,7 +87,7 @@ def with_last_time(time_s: str) -> str:
 
 def test_a_table_is_read_with_its_columns_in_any_order() -> None:
     trajectories = parse_csv(table().encode(), "mine.csv")
-    np.testing.assert_allclose(trajectories.time_s, np.arange(FRAMES) / 30, atol=1e-8)
+    np.testing.assert_allclose(trajectories.object_body.time_s, np.arange(FRAMES) / 30, atol=1e-8)
     np.testing.assert_allclose(trajectories.object_body.position_m[3], WORLD.apply([0.03, 0, 0.5]), atol=1e-8)
     rotmat = (WORLD * Rotation.from_rotvec([0, 0, 0.06])).as_matrix()
     np.testing.assert_allclose(trajectories.object_body.rotmats[3], rotmat, atol=1e-8)
@@ -104,7 +104,7 @@ def test_npz_and_csv_give_the_same_trajectories_in_metres(tmp_path: Path) -> Non
     object_quaternion = Rotation.from_matrix(from_csv.object_body.rotmats).as_quat()[:, [3, 0, 1, 2]]
     np.savez(
         tmp_path / "mine.npz",
-        time_s=from_csv.time_s,
+        time_s=from_csv.object_body.time_s,
         object_position=1000 * from_csv.object_body.position_m,
         object_quaternion=object_quaternion,
         right_position=1000 * from_csv.wrists["right"].position_m,
@@ -124,7 +124,7 @@ def test_manipnets_text_is_mirrored_and_converted_to_metres_at_the_box_centre() 
     np.testing.assert_allclose(trajectories.wrists["left"].rotmats[0], flip @ rotation.as_matrix() @ flip, atol=1e-12)
     assert (trajectories.axes, trajectories.at_box, trajectories.up) == ("canonical", True, (0.0, 1.0, 0.0))
     assert (trajectories.mesh_unit, parse_csv(table().encode(), "mine.csv").mesh_unit) == ("dm", "")
-    np.testing.assert_allclose(np.diff(trajectories.time_s), 1 / 120)
+    np.testing.assert_allclose(np.diff(trajectories.object_body.time_s), 1 / 120)
 
 
 @pytest.mark.parametrize(
