@@ -1,4 +1,4 @@
-"""No byte of the real recordings is in a tracked file or in the wheel; skipped without the variables of their folders."""
+"""No byte of real recordings is in a tracked file or in the wheel; skipped without the variables of their folders."""
 
 import gzip
 import hashlib
