@@ -14,22 +14,24 @@ LEADING = ("action_named", "contact_f1", "joint_error_mm", "deep_share", "jitter
 DIGITS = 6
 
 
-def write_dvc_metrics(out: Path, metrics: Path, checkpoints: Path, families: Mapping[str, Sequence[str]]) -> None:
-    """Write the leading metrics and the validation losses of a profile to the folder ``out``.
+def write_leading_metrics(path: Path, metrics: Path, families: Sequence[str]) -> None:
+    """Write the leading metrics of one dataset for ``dvc metrics``: by family; reasons under ``not measured``."""
+    by_family = _read(metrics, families)
+    unmeasured = _unmeasured(by_family)
+    write_json(path, _leading(by_family) | ({"not measured": unmeasured} if unmeasured else {}))
 
-    Files: ``figures.json`` (dataset, family, metric; reasons of unmeasured metrics under ``not measured``),
-    ``bars/<dataset>.csv`` (one line per family) and ``losses/<dataset>-<network>.csv`` (validation loss by step).
+
+def write_dvc_plots(out: Path, metrics: Path, checkpoints: Path, families: Mapping[str, Sequence[str]]) -> None:
+    """Write the leading metrics and the validation losses of a profile as tables to the folder ``out``.
+
+    Files: ``bars/<dataset>.csv`` (one line per family), ``losses/<dataset>-<network>.csv`` (validation loss by step).
 
     Args:
         metrics: folder with the metrics of each dataset.
         checkpoints: folder with the networks of each dataset; untrained networks are skipped.
         families: by dataset, in the order of the lines.
     """
-    measured = {dataset: _read(metrics / dataset, names) for dataset, names in families.items()}
-    leading = {dataset: _leading(by_family) for dataset, by_family in measured.items()}
-    missing = {dataset: words for dataset, by_family in measured.items() if (words := _unmeasured(by_family))}
-    with_values = {dataset: by_family for dataset, by_family in leading.items() if by_family}
-    write_json(out / "figures.json", with_values | ({"not measured": missing} if missing else {}))
+    leading = {dataset: _leading(_read(metrics / dataset, names)) for dataset, names in families.items()}
     for folder in ("bars", "losses"):
         (out / folder).mkdir()
     for dataset, by_family in leading.items():

@@ -12,7 +12,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -22,18 +22,19 @@ from types import ModuleType
 from typing import Any
 
 from hoidata.errors import BadInput, explain_machine_errors
-from hoidata.files.atomic import exclusive, write_whole
+from hoidata.files.atomic import exclusive
 from hoidata.lifetime import block_ctrl_c, end_with_starter
+from pipelines.sidecar import RUNS
 from pipelines.warm import WarmProcess
 
 CODE = "pipelines/dvc.yaml:code"
 RUN = Path(".hoidata/repro")
 RWLOCK = Path(".dvc/tmp/rwlock")
 LOGS = Path(".hoidata/logs")
-DURATIONS = Path(".hoidata/durations.json")
 # Imported once: importing them in every stage's process takes about a second.
 PRELOADED = ["dvc.cli", "dvc.commands.repro", "dvc.repo.reproduce", "dvc.output", "dvc.stage.run"]
 TAIL = 15
+PROGRESS_S = 5.0  # between two looks at the logs of running stages
 STOP_S = 5.0
 _START_LOCK = threading.Lock()
 _PROBE_BYTES = 1 << 20  # bytes of free space on the disk of the cache that are required before a stage starts
@@ -73,11 +74,11 @@ def reproduce_in_parallel(
         if _timed(CODE, run_stage, run):
             _report_stage(CODE, run, 0)
         else:
-            upstream = stale_stages(targets, children.forced if force else None)
-            if len(upstream) > jobs:
+            plan = stale_stages(targets, force)
+            children.forced = plan.certain if force else frozenset()
+            if len(plan.upstream) > jobs:
                 children.warm.start()
-            run_all(upstream, pool, jobs, run_stage, run)
-            write_whole(DURATIONS, json.dumps({**read_durations(), **run.seconds}, indent=1, sort_keys=True))
+            run_all(plan.upstream, pool, jobs, run_stage, run)
         run.wall = time.monotonic() - start
         return run
 
@@ -106,13 +107,20 @@ def _is_broken(path: Path) -> bool:
         return True
 
 
-def stale_stages(targets: list[str], forced: set[str] | None = None) -> dict[str, frozenset[str]]:
-    """The stages that must run for the targets, each with the stages that it waits for.
+@dataclass(frozen=True)
+class Plan:
+    """The stages that DVC finds changed, and all that depend on them."""
 
-    These are the stages that DVC finds changed and all that depend on them.
+    upstream: Upstream  # each stage with the stages that it waits for
+    certain: frozenset[str]  # the changed stages; the others run if a stage before them writes other bytes
+
+
+def stale_stages(targets: list[str], force: bool = False) -> Plan:
+    """The stages that must run for the targets.
 
     Args:
-        forced: is filled with the names of the targets, which then count as changed.
+        targets: stages; empty for all.
+        force: count the targets as changed.
 
     Raises:
         BadInput: a target does not exist, or another DVC command has locked the project.
@@ -120,13 +128,13 @@ def stale_stages(targets: list[str], forced: set[str] | None = None) -> dict[str
     from dvc.exceptions import DvcException
 
     try:
-        return _ask_dvc(targets, forced)
+        return _ask_dvc(targets, force)
     except DvcException as error:
         got, remedy = str(error), "`dvc stage list --all` names all targets"
         raise BadInput(" ".join(targets) or "dvc.yaml", "stages that DVC can run", got, remedy) from error
 
 
-def _ask_dvc(targets: list[str], forced: set[str] | None) -> dict[str, frozenset[str]]:
+def _ask_dvc(targets: list[str], force: bool) -> Plan:
     import networkx
     from dvc.repo import Repo
     from dvc.repo.reproduce import collect_stages, get_active_graph, plan_repro
@@ -136,19 +144,17 @@ def _ask_dvc(targets: list[str], forced: set[str] | None) -> dict[str, frozenset
         target_stages = collect_stages(repo, targets or ["dvc.yaml"])
         stages = plan_repro(graph, target_stages)
         needed = graph.subgraph(stages)
-        if forced is not None:
-            forced.update(stage.addressing for stage in (target_stages if targets else stages))
-        exempt = {CODE, *(forced or ())}
-        changed = [stage for stage in stages if stage.addressing not in exempt and stage.changed()]
-        changed += [stage for stage in stages if stage.addressing in exempt - {CODE}]
+        forced = set(target_stages if targets else stages) if force else set()
+        changed = [stage for stage in stages if stage.addressing != CODE and (stage in forced or stage.changed())]
         if changed:
             _check_writable(Path(repo.cache.local.path))
         stale = set(changed).union(*(networkx.ancestors(needed, stage) for stage in changed))
-        return {
+        upstream = {
             stage.addressing: frozenset(other.addressing for other in needed.successors(stage) if other in stale)
             for stage in stages
             if stage in stale
         }
+        return Plan(upstream, frozenset(stage.addressing for stage in changed))
 
 
 def _check_writable(folder: Path) -> None:
@@ -162,21 +168,59 @@ def _check_writable(folder: Path) -> None:
 
 def run_all(upstream: Upstream, pool: ThreadPoolExecutor, jobs: int, run_stage: RunStage, run: Run) -> None:
     """Run each stage when its inputs are ready, those with the longest remaining chain first."""
-    remaining = _remaining_seconds(upstream, read_durations())
+    remaining = _remaining_seconds(upstream, likely_seconds(upstream))
     waiting = dict(upstream)
     running: dict[Future[int], str] = {}
+    shown: dict[str, str] = {}  # last progress line by stage
     while waiting or running:
         unfinished = waiting.keys() | set(running.values())
         ready = sorted((name for name in waiting if not waiting[name] & unfinished), key=lambda name: -remaining[name])
         for name in ready[: jobs - len(running)]:
             del waiting[name]
             context = contextvars.copy_context()
+            shown[name] = _progress_line(name)  # of an earlier run
             running[pool.submit(context.run, _timed, name, run_stage, run)] = name
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
+        done = wait(running, PROGRESS_S, return_when=FIRST_COMPLETED).done
+        for name in running.values():
+            if (line := _progress_line(name)) != shown[name]:
+                shown[name] = line
+                print(f"    {name}: {line}", flush=True)
+        for future in done:
             name = running.pop(future)
             if future.result():
                 waiting = _without_dependents(waiting, name)
             _report_stage(name, run, len(upstream))
+
+
+def _progress_line(name: str) -> str:
+    """The last line on the progress of a training (``models.common.progress.Line``) in the log of a stage, or ""."""
+    try:
+        lines = log_of(name).read_text(errors="replace").splitlines()
+    except OSError:
+        return ""
+    return next((line for line in reversed(lines) if line.startswith("step ")), "")
+
+
+def describe_plan(plan: Plan, jobs: int) -> str:
+    """One line per stage of a plan with its likely minutes, and their sum."""
+    seconds = likely_seconds(plan.upstream)
+
+    def minutes(names: Collection[str]) -> str:
+        unknown = sum(name not in seconds for name in names)
+        return f"{sum(seconds.get(name, 0) for name in names) / 60:.1f} min" + f" and {unknown} unknown" * bool(unknown)
+
+    lines = [
+        f"{f'{seconds[name] / 60:.1f} min' if name in seconds else '?':>9}  {name}"
+        + ("" if name in plan.certain else "  (if its inputs change)")
+        for name in plan.upstream
+    ]
+    chain = max(_remaining_seconds(plan.upstream, seconds).values(), default=0.0)
+    wall = max(chain, sum(seconds.values()) / jobs) / 60
+    lines.append(
+        f"{len(plan.upstream)} stages: {minutes(plan.upstream)}, {wall:.1f} min with {jobs} in parallel; "
+        f"{len(plan.certain)} stages are certain: {minutes(plan.certain)}"
+    )
+    return "\n".join(lines)
 
 
 def describe_run(run: Run) -> str:
@@ -239,12 +283,18 @@ def _remaining_seconds(upstream: Upstream, durations: Mapping[str, float]) -> di
     return seconds
 
 
-def read_durations() -> dict[str, float]:
-    """The seconds of the last run of each stage; empty without a record."""
-    try:
-        return {str(name): float(value) for name, value in json.loads(DURATIONS.read_text()).items()}
-    except (OSError, ValueError, TypeError, AttributeError):
-        return {}  # durations only affect the order of stages
+def likely_seconds(names: Iterable[str]) -> dict[str, float]:
+    """The seconds of the last complete run of each stage, else the mean of its kind; unknown stages are missing."""
+    last, by_kind = dict[str, float](), dict[str, list[float]]()
+    for path in sorted(RUNS.glob("*.json")):
+        with suppress(OSError, ValueError, TypeError, KeyError):  # estimates need no record
+            record = json.loads(path.read_bytes())
+            if record["ended"] == "complete":
+                last[record["stage"]] = float(record["seconds"])
+                by_kind.setdefault(record["stage"].partition("@")[0], []).append(last[record["stage"]])
+    means = {kind: sum(seconds) / len(seconds) for kind, seconds in by_kind.items()}
+    likely = {name: last.get(name, means.get(name.partition("@")[0])) for name in names}
+    return {name: seconds for name, seconds in likely.items() if seconds is not None}
 
 
 def log_of(name: str) -> Path:
@@ -266,7 +316,7 @@ class _Children:
         self.cores, self.ends = cores, False
         self.context = multiprocessing.get_context("forkserver")
         self.processes: set[Any] = set()
-        self.forced: set[str] = set()
+        self.forced = frozenset[str]()
         self.warm = WarmProcess()
 
     def __enter__(self) -> "_Children":

@@ -8,11 +8,11 @@ from pathlib import Path
 from hoidata.errors import BadInput, MissingResource
 from pipelines.lineage.graph import look_up, read_graph, written_graph
 from pipelines.lineage.manifests import read_manifest
-from pipelines.parallel_repro import Run, RunStage, reproduce_in_parallel
+from pipelines.parallel_repro import Plan, Run, RunStage, reproduce_in_parallel, stale_stages
 from pipelines.params import read_file, read_params
+from pipelines.stages import code
 from pipelines.stages.adapters import ensure_manifests, raw_files
 from pipelines.stages.base import StagePaths
-from pipelines.stages.code import write_code
 from pipelines.stages.raw import require_hand, write_generated
 
 MAX_JOBS = 4  # a stage may need up to two gigabytes of memory
@@ -34,7 +34,19 @@ def reproduce(
     """
     preflight()
     os.environ.update(stage_environment())
-    return reproduce_in_parallel(targets, jobs or min(MAX_JOBS, len(os.sched_getaffinity(0))), wrap, force)
+    return reproduce_in_parallel(targets, jobs or default_jobs(), wrap, force)
+
+
+def default_jobs() -> int:
+    """The number of parallel stages: one per core, at most 4."""
+    return min(MAX_JOBS, len(os.sched_getaffinity(0)))
+
+
+def plan(targets: list[str], force: bool = False) -> Plan:
+    """The stages that ``reproduce`` would run; writes the digests of the code, which tell DVC what has changed."""
+    require_settings(Path())
+    code.run(StagePaths(""))
+    return stale_stages(targets, force)
 
 
 def stage_environment() -> dict[str, str]:
@@ -98,6 +110,6 @@ def _stale_stages(stages: list[str]) -> set[str]:
     existing = [stage for stage in stages if stage in graph]
     if not existing:
         return set()
-    write_code(Path())
+    code.write_code(Path())
     with Repo() as repo:
         return set(repo.status(targets=existing))

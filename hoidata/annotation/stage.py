@@ -121,7 +121,6 @@ def annotate_store(
         "encoder": encoder.identity,
         "threshold_m": threshold_m,
         "points": contact.points,
-        **({} if settings.hand == "proximity" else {"hand": settings.hand}),
         "forms": settings.forms,
         "counts": counts,
     }

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
 from hoidata.conformance.report import Finding, finding, skipped, undecided
@@ -272,10 +273,29 @@ def _hinge_reversed(clip: Clip, hands: HandPair) -> Clip:
     return clip if hinge is None else replace(clip, object=replace(clip.object, hinge_rad=-hinge))
 
 
+def _quaternions_reordered(order: list[int], hands_too: bool) -> Reading:
+    """Rotations whose quaternions (x, y, z, w) have another order. hands_too: also the hands' global orientation."""
+
+    def reordered(rotvec: np.ndarray) -> np.ndarray:
+        return Rotation.from_quat(Rotation.from_rotvec(rotvec).as_quat()[:, order]).as_rotvec()
+
+    def read(clip: Clip, hands: HandPair) -> Clip:
+        clip = replace(clip, object=replace(clip.object, rotvec=reordered(clip.object.rotvec)))
+        change = _each_hand(lambda track, model: {"global_orient": reordered(track.global_orient)})
+        return change(clip, hands) if hands_too else clip
+
+    return read
+
+
 READINGS: dict[str, Reading] = {
     "with object rotations transposed": lambda clip, _: replace(
         clip, object=replace(clip.object, rotvec=-clip.object.rotvec)
     ),
+    **{
+        f"if quaternions{' of hands too' * hands_too} are {given}, not {read}": _quaternions_reordered(order, hands_too)
+        for given, read, order in (("wxyz", "xyzw", [1, 2, 3, 0]), ("xyzw", "wxyz", [3, 0, 1, 2]))
+        for hands_too in (False, True)
+    },
     "with the mean pose added to the fingers": _with_mean(1),
     "with the mean pose taken from the fingers": _with_mean(-1),
     "with J0 added to the wrist (MANO's transl taken for it?)": _with_wrist(1),

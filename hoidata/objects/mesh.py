@@ -66,7 +66,8 @@ def load_named_mesh(path: str | Path) -> tuple[Mesh, list[NamedPieces]]:
         raise BadInput(path, f"at most {LARGEST_MESH_BYTES} bytes", f"{path.stat().st_size}", "decimate the mesh")
     reader = {".obj": _read_obj, ".ply": _read_ply}.get(path.suffix.lower())
     if reader is None:
-        raise BadInput(path, "a mesh named .obj or .ply", path.suffix or "no suffix", "convert the mesh")
+        remedy = "read .stl and .glb with hoidata.objects.user_mesh.read_mesh_file; convert others"
+        raise BadInput(path, "a mesh named .obj or .ply", path.suffix or "no suffix", remedy)
     try:
         mesh, pieces = reader(path)
     except (ValueError, OSError) as error:

@@ -9,7 +9,7 @@
                                       of the source; derived: from the motion), verb_evidence (reason for the verb)
                   hand_distance.npz   distance of each hand in each frame (``hoidata.store.hand_evidence``)
                   embeddings.npz      features (sentence, 512) float32, sentences (sentence,) text, identity JSON bytes
-                  info.json           encoder, threshold_m, points, hand (unless it is proximity), forms, counts
+                  info.json           encoder, threshold_m, points, forms, counts
     contact/      objects.parquet     object, row, method        points.npz    (object, 1024, ...) sampled points
                   clips.parquet       clip_id, row, shard, and per side <side>_start, <side>_stop: rows of the shard
                   contact.npz         <side>_frames (clip, 1024) uint16: number of frames in which each point is touched

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ from hoidata.files import atomic_file, remove_dead_leftovers, write_whole
 STATE_NAME, LOG_NAME = "state.safetensors", "log.csv"
 # Seconds between two saves, and the least multiple of the last save's duration: saving takes at most 1/50 of the time.
 SAVE_AFTER_S, SAVE_INTERVAL_FACTOR = 10.0, 50
+# Seconds between two lines of a training, and their largest number per doubling of its duration.
+LINE_AFTER_S, LINES_PER_DURATION = 5.0, 50
 Row = dict[str, float | None]
 WEIGHTS = "weights that are not finite"
 
@@ -146,6 +149,24 @@ class Progress:
     def _report(self, message: str) -> None:
         if self.writes:
             print(f"training in {self.folder} {message}", file=sys.stderr)
+
+
+class Line:
+    """Prints step, loss and time left of a training; `hoidata repro` repeats the line from the stage's log."""
+
+    def __init__(self, step: int, steps: int) -> None:
+        """step: after which the training starts or resumes."""
+        self.first, self.steps, self.start_s = step, steps, time.monotonic()
+        self.next_s = self.start_s + LINE_AFTER_S
+
+    def print_if_due(self, step: int, loss: Tensor) -> None:
+        """After a step: print a line to standard error; reading the loss waits for the device."""
+        now = time.monotonic()
+        if now < self.next_s:
+            return
+        left = timedelta(seconds=round((now - self.start_s) / (step - self.first) * (self.steps - step)))
+        print(f"step {step:,} of {self.steps:,}, loss {float(loss):.4g}, {left} left", file=sys.stderr, flush=True)
+        self.next_s = now + max(LINE_AFTER_S, (now - self.start_s) / LINES_PER_DURATION)
 
 
 def all_finite(tensors: Mapping[str, Tensor]) -> bool:

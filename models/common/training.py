@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from rich.progress import track
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
@@ -36,7 +35,7 @@ from models.common.corpus import BatchSpec, Corpus, batches
 from models.common.family import Network, Objective, Setup
 from models.common.features import Hands, Normaliser
 from models.common.precision import Precision, compute_in
-from models.common.progress import LOG_NAME, WEIGHTS, Diverged, Progress, Row, State, all_finite, write_log
+from models.common.progress import LOG_NAME, WEIGHTS, Diverged, Line, Progress, Row, State, all_finite, write_log
 from models.common.repeatable import restored_rng, seeded_generator
 from models.common.team import Team
 
@@ -288,12 +287,12 @@ def fit(
         augmented_copies=config.augmented_copies,
     )
     stream = batches(corpus.train, config.batch, seed, batch_spec, state.step)
-    remaining, losses = range(state.step + 1, config.steps + 1), dict[int, Tensor]()
+    losses, line = dict[int, Tensor](), Line(state.step, config.steps)
     check_every = CHECK_EVERY_ON_CPU if device.type == "cpu" else CHECK_EVERY
-    for step in track(remaining, description=type(network).__name__, transient=True, disable=not team.writes):
+    for step in range(state.step + 1, config.steps + 1):
         optimiser.zero_grad(set_to_none=True)
         numbers = seed, step, config.micro_batches
-        losses[step] = _add_gradients(state, objective, next(stream), numbers, device, team)
+        losses[step] = loss = _add_gradients(state, objective, next(stream), numbers, device, team)
         is_validated = step % config.validate_every == 0 or step == config.steps
         if is_validated or step % check_every == 0:
             _refuse_not_finite(losses, state)
@@ -303,6 +302,8 @@ def fit(
             _validate(state, objective if len(corpus.validation) else None, config)
         if progress:
             progress.save_if_due(state, config.save_every)
+        if team.writes:
+            line.print_if_due(step, loss)
     if not all_finite(state.ema_network.state_dict()):
         raise Diverged(state.step, WEIGHTS, state)
     if state.best:

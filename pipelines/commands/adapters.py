@@ -1,5 +1,6 @@
 """``hoidata adapters`` and ``hoidata convert``: list, check and run dataset adapters without a project."""
 
+import sys
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -58,7 +59,7 @@ def list_adapters() -> None:
         facts, settings = entry.adapter, "\n".join(f"{key}={value!r}" for key, value in entry.settings.items())
         shared = "yes" if facts.may_be_shared else "no"
         table.add_row(*map(escape, (entry.name, facts.version, facts.licence, shared, entry.origin, settings)))
-    Console().print(table)
+    Console(width=None if sys.stdout.isatty() else 140).print(table)
 
 
 @app.command()
@@ -174,6 +175,6 @@ def _print(name: str, findings, note: str) -> None:
     for item in findings:
         table.add_row(f"[{COLOURS[item.outcome]}]{item.outcome}", escape(item.rule), escape(item.detail))
     counts = Counter(item.outcome for item in findings)
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 140)
     console.print(table)
     console.print(", ".join(f"{counts[outcome]} {outcome}" for outcome in COLOURS if counts[outcome]))

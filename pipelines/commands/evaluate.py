@@ -80,11 +80,17 @@ def table(
     ],
     metrics: Annotated[str, typer.Option(help="Names of metrics (hoidata/metrics/README.md), separated by commas.")],
 ) -> None:
-    """Print metrics of all families and controls as a Markdown table, and mark those worse than retrieval."""
+    """Print metrics of all families and controls as a Markdown table.
+
+    It marks metrics worse than retrieval, and methods whose motions or networks have changed since they were measured.
+    """
+    from pipelines.lineage.locks import outdated_samples
     from pipelines.pages.metrics_table import markdown_table
 
     families = sorted(path.stem for path in folder.glob("*.json"))
-    typer.echo(markdown_table(folder, families, metrics.split(",")), nl=False)
+    of_project = (path := folder.resolve()).parent.parent.name == "metrics"
+    stale = outdated_samples(path.parents[2], path.parent.name, path.name) if of_project else {}
+    typer.echo(markdown_table(folder, families, metrics.split(","), stale), nl=False)
 
 
 def controls(

@@ -13,12 +13,18 @@ def repro(
     ] = None,
     jobs: Annotated[int, typer.Option(help="Number of parallel stages; 0 means one per core, at most 4.", min=0)] = 0,
     force: Annotated[bool, typer.Option("--force", help="Run the targets even if nothing has changed.")] = False,
+    dry: Annotated[
+        bool, typer.Option("--dry", help="Run nothing; list the stages that would run, with their likely minutes.")
+    ] = False,
 ) -> None:
     """Run all stages whose inputs have changed, in parallel; first check that the raw files exist."""
     enter_project()
-    from pipelines.parallel_repro import describe_run
-    from pipelines.repro import reproduce
+    from pipelines.parallel_repro import describe_plan, describe_run
+    from pipelines.repro import default_jobs, plan, reproduce
 
+    if dry:
+        print(describe_plan(plan(targets or [], force), jobs or default_jobs()))
+        return
     run = reproduce(targets or [], jobs, force=force)
     print(describe_run(run))
     raise typer.Exit(1 if run.failed else 0)

@@ -4,6 +4,7 @@
 """
 
 import json as json_module
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +19,7 @@ from pipelines.commands.project import enter_project
 
 SCHEMA = "hoidata.lineage/2"
 SHOW = "of"
+UNCUT = 100_000  # characters in a line of a file or pipe
 COLOURS = {"same": "green", "recorded": "cyan", "uncommitted": "yellow", "changed": "yellow"}
 FACTS = ("stage", "model", "config", "seed", "synthetic", "libraries", "clips", "params_digest", "code_digest")
 
@@ -233,7 +235,9 @@ def _print_raw(sources: list) -> None:
 def _print_tree(tree, record: dict, show_clips: bool) -> None:
     from pipelines.lineage.tree import overall_status
 
-    console, top = Console(), Tree(_label(tree))
+    is_terminal = sys.stdout.isatty()
+    # A tree cuts lines at the width; a terminal wraps them instead.
+    console, top = Console(width=None if is_terminal else UNCUT), Tree(_label(tree))
     for child in tree.children:
         _add_branch(top, child)
     clips = {} if tree.kind == "motion" else record.get("clips", {})
@@ -244,7 +248,7 @@ def _print_tree(tree, record: dict, show_clips: bool) -> None:
             names.add(escape(clip_id))
         if len(ids) > 3 and not show_clips:
             names.add(f"and {len(ids) - 3} more (--clips lists all)")
-    console.print(top, soft_wrap=True)
+    console.print(top, soft_wrap=not is_terminal)
     if libraries := record.get("libraries"):
         versions = ", ".join(f"{name} {version}" for name, version in libraries.items())
         console.print(f"libraries: {escape(versions)}", soft_wrap=True, highlight=False)

@@ -97,6 +97,31 @@ def cached_listing(root: Path, digest: str) -> dict[str, str]:
         return {}
 
 
+def outdated_samples(root: Path, profile: str, dataset: str) -> dict[str, str]:
+    """Methods whose metrics are older than an input, by name, with the path of that input. Reads only lock files.
+
+    The inputs are those of the sampled motions, direct or indirect, and the motions themselves.
+    """
+    locks, folder = read_locks(root), f"samples/{profile}/{dataset}"
+    makers = {out: lock for lock in locks.values() for out in lock.outs}
+    evaluated = locks.get(f"evaluate@{profile}-{dataset}", Locked("")).deps.get(folder, "")
+    measured = cached_listing(root, evaluated)
+
+    def changed_input(lock: Locked) -> str:
+        inputs = [(path, digest, makers[path]) for path, digest in lock.deps.items() if path in makers]
+        changed = (path for path, digest, maker in inputs if maker.outs[path] != digest)
+        return next(changed, "") or next(filter(None, (changed_input(maker) for *_, maker in inputs)), "")
+
+    def outdated(path: str) -> str:
+        start = f"{path.removeprefix(folder)[1:]}/"
+        files = {name.removeprefix(start): md5 for name, md5 in measured.items() if name.startswith(start)}
+        is_measured = not measured or listing_digest(files) == makers[path].outs[path]
+        return changed_input(makers[path]) if is_measured else path
+
+    samples = [path for path in makers if path.startswith(f"{folder}/")]
+    return {Path(path).name: cause for path in samples if (cause := outdated(path))}
+
+
 def written_digest(path: Path) -> str | None:
     """The MD5 that a file had when its stage wrote it, from dvc.lock of its project; None if not recorded."""
     path = Path(os.path.abspath(path))

@@ -120,6 +120,8 @@
     const left = Number(timeline.dataset.left), right = Number(timeline.dataset.right);
     const part = Math.min(1, player.seconds / player.duration);
     timeline.querySelector(".cursor").style.left = `${left + (right - left) * part}%`;
+    const box = timeline.parentElement;  // on a narrow screen the curves are wider than their box
+    box.scrollLeft = timeline.offsetWidth * (left + (right - left) * part) / 100 - box.clientWidth / 2;
     timeline.querySelectorAll(".readout").forEach((readout, number) => {
       readout.querySelectorAll("b").forEach((text, line) => {
         const { values, decimals } = charts[number][line], value = values[player.frame()];

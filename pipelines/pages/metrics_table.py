@@ -173,13 +173,19 @@ def _of_topic(title: str, metrics: list[AnyMetric]) -> list[AnyMetric]:
     return [metric for metric in metrics if metric.topic == title]
 
 
-def markdown_table(folder: str | Path, families: Sequence[str], names: Sequence[str]) -> str:
+def markdown_table(
+    folder: str | Path, families: Sequence[str], names: Sequence[str], stale: Mapping[str, str] | None = None
+) -> str:
     """The metrics ``names`` of every evaluated method as a Markdown table.
 
     A cell has its 95 % interval over clips, and says if it is worse than a retrieval baseline. Reasons of methods that
     were not evaluated and of unmeasured metrics follow below the table. Raises BadInput for an unknown metric.
+
+    Args:
+        stale: methods whose metrics are older than an input, with that input.
     """
     files, by_name = _read_files(Path(folder), families), {metric.name: metric for metric in ALL_METRICS}
+    stale = stale or {}
     if unknown := [name for name in names if name not in by_name]:
         raise BadInput("metric", f"one of {', '.join(by_name)}", ", ".join(unknown), "correct the name")
     metrics = [by_name[name] for name in names]
@@ -189,9 +195,11 @@ def markdown_table(folder: str | Path, families: Sequence[str], names: Sequence[
     for family, content in files.contents.items():
         if "figures" in content:
             cells = [_cell(family, metric, files) for metric in metrics]
-            lines.append(f"| {family} | {' | '.join(_marked(cell, files.kind(family)) for cell in cells)} |")
+            name = f"{family} (stale)" if family in stale else family
+            lines.append(f"| {name} | {' | '.join(_marked(cell, files.kind(family)) for cell in cells)} |")
         else:
             below.append(f"- {family}: not evaluated, {content['empty']}")
+    below += [f"- {family}: stale, {cause} has changed since" for family, cause in stale.items() if family in families]
     below += [f"- {metric.title}: not measured, {words}" for metric in metrics if (words := _reasons(metric, files))]
     return "\n".join([*lines, *([""] if below else []), *below]) + "\n"
 

@@ -59,6 +59,7 @@ class StagePaths:
     evaluators = _At("evaluators/{profile}/{dataset}")
     samples = _At("samples/{profile}/{dataset}/{family}")
     metrics = _At("metrics/{profile}/{dataset}")
+    leading_metrics = _At("metrics/{profile}/{dataset}.json")
     measured = _At(".hoidata/measured/{profile}/{dataset}/{family}.json")
     report = _At("report/{profile}")
 

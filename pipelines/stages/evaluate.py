@@ -11,6 +11,7 @@ from hoidata.files import write_whole
 from hoidata.files.atomic import atomic_folder, canonical_json
 from hoidata.files.written import read_json, read_json_rows
 from pipelines.lineage.digests import path_digest, value_digest
+from pipelines.metrics_files import write_leading_metrics
 from pipelines.params import read_params
 from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, load_settings, write_json
 from pipelines.stages.families import families_of
@@ -29,7 +30,8 @@ class EvaluateSettings:
 
 
 def run(paths: StagePaths) -> None:
-    """Write ``<family>.json`` for each family of params.yaml and ``controls/<name>.json`` for each control.
+    """Write ``<family>.json`` for each family of params.yaml and ``controls/<name>.json`` for each control,
+    and their leading metrics for ``dvc metrics``.
 
     The file of a dataset or family without motions has the reason instead. Metrics of an earlier run are reused if
     their inputs have not changed, so that a new family does not measure the others again.
@@ -45,6 +47,7 @@ def run(paths: StagePaths) -> None:
     with atomic_folder(paths.metrics) as partial:
         for name, values in metrics.items():
             write_json(partial / f"{name}.json", values)
+    write_leading_metrics(paths.leading_metrics, paths.metrics, families)
 
 
 def _controls(paths: StagePaths) -> Iterator[tuple[str, StagePaths]]:

@@ -10,7 +10,7 @@ from pipelines.stages.families import families_of
 def run(paths: StagePaths) -> None:
     """Write the page; datasets without clips are listed with their reason."""
     from hoidata.files.atomic import atomic_folder
-    from pipelines.metrics_files import write_dvc_metrics
+    from pipelines.metrics_files import write_dvc_plots
     from pipelines.pages.report import ReportFolders, write_report
 
     params = read_params(Path())
@@ -18,4 +18,4 @@ def run(paths: StagePaths) -> None:
         families = {dataset: families_of(params, dataset) for dataset in params["datasets"]}
         write_report(partial, paths.profile, families, load_hands(paths.profile))
         folders = ReportFolders.of(paths.profile)
-        write_dvc_metrics(partial, folders.metrics, folders.checkpoints, families)
+        write_dvc_plots(partial, folders.metrics, folders.checkpoints, families)

@@ -21,7 +21,7 @@ from hoidata.errors import BadInput
 from hoidata.store.annotated import AnnotatedStore
 from models.common.corpus import BatchSpec, batches
 from models.common.family import Network, Setup
-from models.common.progress import Progress, State
+from models.common.progress import Line, Progress, State
 from models.common.team import Team, run_team
 from models.common.training import _add_gradients, train_network
 from models.registry import load_network
@@ -126,6 +126,23 @@ def test_saving_takes_a_fiftieth_of_the_time_at_most(tmp_path: Path, monkeypatch
         now[0], state.step = now[0] + 1, step
         progress.save_if_due(state, 1000)
     assert saved == [10, 163, 316]
+
+
+def test_a_line_has_step_loss_and_time_left_and_lines_become_rarer(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+) -> None:
+    """One second per step, after step 100 of a resumed training: a line after 5 s, later every fiftieth of the time."""
+    clock = SimpleNamespace(monotonic=lambda: clock.now, now=0.0)
+    monkeypatch.setattr("models.common.progress.time", clock)
+    line = Line(100, 3700)
+    for step in range(101, 3701):
+        clock.now += 1.0
+        line.print_if_due(step, torch.tensor(0.5))
+    lines = capfd.readouterr().err.splitlines()
+    assert lines[0] == "step 105 of 3,700, loss 0.5, 0:59:55 left"
+    steps = [int(text.split()[1].replace(",", "")) for text in lines]
+    assert np.diff(steps)[:10].tolist() == [5] * 10
+    assert np.diff(steps)[-1] in (70, 71, 72)
 
 
 def test_logged_losses_are_those_of_the_whole_team(annotated: AnnotatedStore, monkeypatch: pytest.MonkeyPatch) -> None:

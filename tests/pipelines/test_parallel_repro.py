@@ -1,5 +1,6 @@
 """Parallel stages: order of the DVC graph, number of jobs, failures and signals."""
 
+import json
 import signal
 import subprocess
 import sys
@@ -17,10 +18,14 @@ from hoidata.errors import BadInput
 from hoidata.files.atomic import exclusive
 from pipelines.parallel_repro import (
     CODE,
+    LOGS,
     RUN,
     RWLOCK,
+    Plan,
     Run,
+    RunStage,
     _signal_group,
+    describe_plan,
     describe_run,
     forget_broken_lock,
     log_of,
@@ -28,6 +33,7 @@ from pipelines.parallel_repro import (
     run_all,
     stale_stages,
 )
+from pipelines.sidecar import RUNS
 
 PROJECT = Path(__file__).parents[2]
 pytestmark = [
@@ -63,7 +69,7 @@ def _in_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-def run_graph(upstream: dict[str, frozenset[str]], jobs: int, recorder: Recorder) -> Run:
+def run_graph(upstream: dict[str, frozenset[str]], jobs: int, recorder: RunStage) -> Run:
     run = Run(seconds={CODE: 0.0})
     with ThreadPoolExecutor(jobs) as pool:
         run_all(upstream, pool, jobs, recorder, run)
@@ -103,6 +109,35 @@ def test_a_failure_stops_its_dependents_and_nothing_else(upstream, data):
     assert set(run.seconds) == set(upstream) - lost | {failing, CODE}
     assert list(run.failed) == [failing]
     assert failing in describe_run(run)
+
+
+def test_a_plan_lists_each_stage_with_the_minutes_of_its_last_run_or_of_its_kind():
+    RUNS.mkdir(parents=True)
+    for stage, seconds, ended in (("a@x", 120, "complete"), ("a@y", 240, "complete"), ("b@x", 6, "failed")):
+        (RUNS / f"{stage}.json").write_text(json.dumps({"stage": stage, "seconds": seconds, "ended": ended}))
+    (RUNS / "c@x.json").write_text("{")
+    upstream = {"a@x": frozenset(), "a@z": frozenset(), "b@x": frozenset({"a@x", "a@z"})}
+    assert describe_plan(Plan(upstream, frozenset({"a@x", "a@z"})), jobs=2).splitlines() == [
+        "  2.0 min  a@x",
+        "  3.0 min  a@z",
+        "        ?  b@x  (if its inputs change)",
+        "3 stages: 5.0 min and 1 unknown, 3.0 min with 2 in parallel; 2 stages are certain: 5.0 min",
+    ]
+
+
+def test_the_progress_of_a_running_training_is_repeated_once_per_line(monkeypatch, capfd):
+    monkeypatch.setattr("pipelines.parallel_repro.PROGRESS_S", 0.01)
+    LOGS.mkdir(parents=True)
+    log_of("a").write_text("step 9 of 9, loss 1, 0:00:00 left\n")  # of an earlier run
+
+    def train(name: str) -> int:
+        time.sleep(0.05)
+        log_of(name).write_text("> python\nstep 1 of 2, loss 3, 0:00:01 left\n")
+        time.sleep(0.3)
+        return 0
+
+    run_graph({"a": frozenset()}, 1, train)
+    assert capfd.readouterr().out.splitlines()[:-1] == ["    a: step 1 of 2, loss 3, 0:00:01 left"]
 
 
 START = """
@@ -151,8 +186,9 @@ def test_a_run_equals_dvc_repro_and_a_second_run_does_nothing(tmp_path):
     with pytest.raises(BadInput, match="'x' not found"):
         reproduce_in_parallel(["x"], jobs=2)
     (tmp_path / "b.src").write_text("B")
-    assert stale_stages([]) == {"b": frozenset(), "d": frozenset("b")}
-    assert stale_stages(["c"]) == {}
+    assert stale_stages([]) == Plan({"b": frozenset(), "d": frozenset("b")}, frozenset("b"))
+    assert stale_stages(["c"]) == Plan({}, frozenset())
+    assert stale_stages(["c"], force=True) == Plan({"c": frozenset()}, frozenset("c"))
     assert sorted(reproduce_in_parallel(["d"], jobs=1).seconds) == ["b", "d", CODE]
     assert sorted(reproduce_in_parallel(["b"], jobs=1, force=True).seconds) == ["b", CODE]
     assert "made b.out" in log_of("b").read_text()

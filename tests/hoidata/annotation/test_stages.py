@@ -114,7 +114,6 @@ def test_the_labelled_hand_is_used_if_requested_and_tracked(tmp_path: Path) -> N
     assert sample.active_hands.tolist() == [True, False]
     np.testing.assert_array_equal(sample.contact[0], annotated.contact_of("toy/s3/3", "left"))
     assert not sample.contact[1].any()
-    assert annotated.annotation_info["hand"] == "annotated-else-proximity"
     counts = annotated.annotation_info["counts"]
     assert (counts["labelled"], counts["agreeing"], counts["left"], counts["both"]) == (4, 1, 2, 0)
 

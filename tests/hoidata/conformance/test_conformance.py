@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from hoidata.clips.clip import Clip
+from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.conformance.check import Finding, check_adapter
 from hoidata.conformance.loading import first_difference, opened_files
 from hoidata.datasets import DatasetPart, RawTree, SequenceKey, get_adapter
@@ -122,6 +123,23 @@ def transposed(clip: Clip) -> Clip:
     return replace(clip, object=replace(clip.object, rotvec=-clip.object.rotvec))
 
 
+def quaternions_from(order: list[int], sides: tuple[Side, ...] = ()) -> Callable[[Clip], Clip]:
+    """Rotations of the object, and of the hands of these sides, from quaternions (x, y, z, w) in another order."""
+
+    def wrong(rotvec: np.ndarray) -> np.ndarray:
+        return Rotation.from_quat(Rotation.from_rotvec(rotvec).as_quat()[:, order]).as_rotvec().astype("f4")
+
+    def change(clip: Clip) -> Clip:
+        hands = {s: replace(t, global_orient=wrong(t.global_orient)) for s, t in clip.hands.items() if s in sides}
+        track = replace(clip.object, rotvec=wrong(clip.object.rotvec))
+        return replace(clip, object=track, hands={**clip.hands, **hands})
+
+    return change
+
+
+WXYZ_AS_XYZW, XYZW_AS_WXYZ = [3, 0, 1, 2], [1, 2, 3, 0]
+
+
 def without_mean(clip: Clip) -> Clip:
     hands = {s: replace(t, hand_pose=(t.hand_pose - HANDS[s].mean_pose).astype("f4")) for s, t in clip.hands.items()}
     return replace(clip, hands=hands)
@@ -224,6 +242,10 @@ def test_a_mistake_in_clips_is_caught(mistake: str, example: type, kitchen_root:
         (GrabAdapter, "grab", sides_exchanged, "sides exchanged, or mirrored?"),
         (ArcticAdapter, "arctic", without_mean, "with the mean pose added"),
         (ArcticAdapter, "arctic", transposed, "with object rotations transposed"),
+        (ArcticAdapter, "arctic", quaternions_from(WXYZ_AS_XYZW), "if quaternions are wxyz, not xyzw"),
+        (GrabAdapter, "grab", quaternions_from(WXYZ_AS_XYZW), "if quaternions are wxyz, not xyzw"),
+        (H2OAdapter, "h2o", quaternions_from(XYZW_AS_WXYZ), "if quaternions are xyzw, not wxyz"),
+        (H2OAdapter, "h2o", quaternions_from(WXYZ_AS_XYZW, SIDES), "if quaternions of hands too are wxyz, not xyzw"),
     ],
 )
 @pytest.mark.slow

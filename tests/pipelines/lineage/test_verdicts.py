@@ -12,10 +12,11 @@ from hoidata.errors import BadInput
 from hoidata.files.atomic import canonical_json, sha256_file
 from hoidata.files.checksums import payload_digest
 from pipelines.lineage.check import check
-from pipelines.lineage.locks import dvc_digest
+from pipelines.lineage.locks import CACHE, dvc_digest, listing_digest, outdated_samples
 from pipelines.lineage.raw import raw_sources
 from pipelines.lineage.targets import find_target
 from pipelines.lineage.tree import overall_status, target_tree
+from pipelines.pages.metrics_table import markdown_table
 from tests.builders.folders import write_text
 
 pytestmark = pytest.mark.slow
@@ -242,3 +243,30 @@ def test_check_hashes_all_files_and_lists_those_that_have_changed(ran, victim, n
     assert any(f"{node.kind} {node.name}".startswith(node_prefix) for node in changed)
     target = find_target(ran.root, "checkpoints/embedded/grab/length", ran.root)
     assert all("contact" not in node.name for node in check(ran.root, target))
+
+
+def test_metrics_are_outdated_after_a_network_or_motions_were_written_again(tmp_path):
+    """a and b are two methods; b needs the network, and a file of b was measured before it was sampled again."""
+
+    def digest(number: int) -> str:
+        return listing_digest({"x": str(number)})
+
+    def write(network: str, b: str) -> dict[str, str]:
+        samples, out = "samples/p/grab", "checkpoints/p/grab/net"
+        stages = {
+            "train": {"outs": [{"path": out, "md5": network}]},
+            "a": {"outs": [{"path": f"{samples}/a", "md5": digest(1)}]},
+            "b": {"deps": [{"path": out, "md5": "n1"}], "outs": [{"path": f"{samples}/b", "md5": b}]},
+            "evaluate@p-grab": {"deps": [{"path": samples, "md5": "ab.dir"}]},
+        }
+        (tmp_path / "dvc.lock").write_text(yaml.safe_dump({"stages": stages}))
+        return outdated_samples(tmp_path, "p", "grab")
+
+    listing = tmp_path / CACHE / "ab/.dir"
+    listing.parent.mkdir(parents=True)
+    listing.write_text(json.dumps([{"relpath": "a/x", "md5": "1"}, {"relpath": "b/x", "md5": "2"}]))
+    assert write("n1", digest(2)) == {}
+    assert write("n2", digest(2)) == {"b": "checkpoints/p/grab/net"}
+    assert write("n1", digest(3)) == {"b": "samples/p/grab/b"}
+    table = markdown_table(tmp_path, ["b"], ["contact_f1"], {"b": "samples/p/grab/b"})
+    assert "- b: stale, samples/p/grab/b has changed since" in table

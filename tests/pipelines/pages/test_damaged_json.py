@@ -18,7 +18,7 @@ from hoidata.store.annotated import load_annotated
 from pipelines.expected_orderings import check_orderings, read_methods
 from pipelines.lineage.check import compare_made
 from pipelines.lineage.manifests import read_manifest
-from pipelines.metrics_files import LEADING, write_dvc_metrics
+from pipelines.metrics_files import LEADING, write_dvc_plots
 from pipelines.pages import quality
 from pipelines.pages.clip_page_facts import clip_quality
 from pipelines.pages.dataset_page import split_rows
@@ -103,7 +103,7 @@ def read_all_metrics() -> None:
     check_orderings(read_methods(METRICS))
     shutil.rmtree("figures", ignore_errors=True)
     Path("figures").mkdir()
-    write_dvc_metrics(Path("figures"), METRICS.parent, Path("checkpoints"), {"grab": families})
+    write_dvc_plots(Path("figures"), METRICS.parent, Path("checkpoints"), {"grab": families})
 
 
 def read_a_manifest() -> None:

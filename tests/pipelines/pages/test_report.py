@@ -9,7 +9,7 @@ from hoidata.clips.quarantine import Quarantined
 from hoidata.store.annotated import load_annotated
 from models.common.predicting import sample_family
 from models.registry import load_family
-from pipelines.metrics_files import write_dvc_metrics
+from pipelines.metrics_files import write_leading_metrics
 from pipelines.pages.curves import Curve, Panel, log_curves, panels_svg, read_log
 from pipelines.pages.examples import shown_ids
 from pipelines.pages.player import three_javascript
@@ -132,15 +132,15 @@ def test_wide_positive_ranges_are_drawn_logarithmically():
 
 
 def test_a_leading_metric_that_was_not_measured_is_named_with_its_reason_apart_from_the_numbers(tmp_path):
-    metrics, out = tmp_path / "metrics" / "arctic", tmp_path / "out"
-    metrics.mkdir(parents=True)
-    out.mkdir()
+    metrics, out = tmp_path / "arctic", tmp_path / "arctic.json"
+    metrics.mkdir()
     figures = {"contact_f1": 0.5}
     without = {"deep_share": {"the object has no inside": 257}, "slip_cm_s": {"no such frame": 3}}
     (metrics / "ours.json").write_text(json.dumps({"figures": figures, "unmeasured": without}))
     (metrics / "whole.json").write_text(json.dumps({"figures": figures}))
-    write_dvc_metrics(out, tmp_path / "metrics", tmp_path / "checkpoints", {"arctic": ["ours", "whole"]})
-    assert json.loads((out / "figures.json").read_text()) == {
-        "arctic": {"ours": figures, "whole": figures},
-        "not measured": {"arctic": {"ours": {"deep_share": "the object has no inside: 257 clips"}}},
+    write_leading_metrics(out, metrics, ["ours", "whole"])
+    assert json.loads(out.read_text()) == {
+        "ours": figures,
+        "whole": figures,
+        "not measured": {"ours": {"deep_share": "the object has no inside: 257 clips"}},
     }
