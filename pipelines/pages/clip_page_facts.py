@@ -101,7 +101,7 @@ def hand_decision(annotated: AnnotatedStore, clip: Clip, series: ClipSeries) -> 
 
 def _annotated_rule(annotated: AnnotatedStore, source: Any) -> str:
     """The addition to the rule if the stage annotate used labels of the source; else ""."""
-    if not (annotated.hand_types["source"] == "annotated").any():
+    if "annotated" not in set(annotated.hand_types["source"]):
         return ""
     used = "as for this clip" if source == "annotated" else "but not for this clip"
     return f" If the source has a label of the hand, the label is used instead, {used}."
