@@ -16,7 +16,7 @@ from hoidata.store.hand_evidence import HandEvidence
 
 # All thresholds are ours. A smaller hinge rotation can be a side effect of the grasp.
 HINGE_RAD = np.deg2rad(15)
-MIN_NET_HINGE_FRACTION = 0.5  # net rotation over range: above it the verb is open or close, below it operate
+MIN_NET_HINGE_FRACTION = 0.5  # net rotation over range: above it the verb is open or close, below it both
 # Higher than LIFTED_M is a lift; below RAISED_M the object has not left its support (ManipNet's 1.5 cm).
 LIFTED_M, RAISED_M = 0.10, 0.015
 LOWERED_M = 0.05
@@ -59,7 +59,7 @@ def derive_verb(clip: Clip, evidence: HandEvidence) -> Derived:
     """Derive the verb from the motion of a clip. The first rule that applies decides:
 
     - open, close: the hinge rotates by 15 degrees or more, away from or towards zero (closed, in ARCTIC).
-    - operate: the hinge rotates as far and returns.
+    - open and close, close and open: the hinge rotates as far and returns.
     - shake: three fast oscillations or more.
     - place: the object ends 5 cm lower than it starts, at rest. Needs ``clip.gravity``, like lift and grasp.
     - lift: the object rises by 10 cm or more.
@@ -129,7 +129,8 @@ def _hinge(motion: ObjectMotion) -> Derived | None:
     opened = abs(angle[-1]) - abs(angle[0])
     facts = f"hinge from {angle[0]:.2f} to {angle[-1]:.2f} rad, between {angle.min():.2f} and {angle.max():.2f}"
     if abs(opened) < MIN_NET_HINGE_FRACTION * np.ptp(angle):
-        return Derived("operate", facts)
+        middle = abs(angle[np.abs(angle - angle[0]).argmax()])
+        return Derived("open and close" if middle > abs(angle[0]) else "close and open", facts)
     return Derived("open" if opened > 0 else "close", facts)
 
 

@@ -109,12 +109,16 @@ class Grammar:
 
 @lru_cache(maxsize=4096)
 def inflect_verb(base: str) -> VerbForms:
-    """Inflect the first word of a verb that is not in the table (``zip up``).
+    """Inflect the first word of a verb that is not in the table (``zip up``), of each verb joined by "and".
 
     lemminflect's dictionary has some 20,000 verbs, including irregular ones; others are treated as regular.
     """
     from lemminflect import getInflection
 
+    if " and " in base:
+        first, second = map(inflect_verb, base.split(" and ", 1))
+        names = ("gerund", "past_participle", "third_singular")
+        return VerbForms(base, *(f"{getattr(first, name)} and {getattr(second, name)}" for name in names))
     head, _, rest = base.partition(" ")
     listed = [getInflection(head, tag=tag, inflect_oov=False) for tag in ("VBG", "VBN", "VBZ")]
     forms = [

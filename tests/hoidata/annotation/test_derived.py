@@ -64,7 +64,8 @@ SLIDE = clip(BOX, path_m=along(0, 0.12 * SMOOTH))
 EITHER_WAY = {
     "a hinge leaves zero": (clip(NOTEBOOK, hinge_rad=0.1 + 0.5 * SMOOTH), "open", "close"),
     "a hinge leaves zero downwards": (clip(NOTEBOOK, hinge_rad=-0.1 - 0.5 * SMOOTH), "open", "close"),
-    "a hinge comes back": (clip(NOTEBOOK, hinge_rad=0.2 + 0.6 * THERE_AND_BACK), "operate", "operate"),
+    "a hinge comes back": (clip(NOTEBOOK, hinge_rad=0.2 + 0.6 * THERE_AND_BACK), *["open and close"] * 2),
+    "an open hinge comes back": (clip(NOTEBOOK, hinge_rad=0.8 - 0.6 * THERE_AND_BACK), *["close and open"] * 2),
     "a hinge turns by 11 degrees": (clip(NOTEBOOK, hinge_rad=0.2 + 0.2 * SMOOTH), "touch", "touch"),
     "a hinge turns by 13 degrees": (clip(NOTEBOOK, hinge_rad=0.1 + np.deg2rad(13) * SMOOTH), "touch", "touch"),
     "a hinge turns by 17 degrees": (clip(NOTEBOOK, hinge_rad=0.1 + np.deg2rad(17) * SMOOTH), "open", "close"),
@@ -217,7 +218,7 @@ def test_a_world_that_is_turned_and_shifted_changes_no_verb(rotation: tuple[floa
 MOTIONS = {
     "open": clip(NOTEBOOK, hinge_rad=0.1 + 0.5 * SMOOTH),
     "close": clip(NOTEBOOK, hinge_rad=0.6 - 0.5 * SMOOTH),
-    "operate": clip(NOTEBOOK, hinge_rad=0.2 + 0.6 * THERE_AND_BACK),
+    "open and close": clip(NOTEBOOK, hinge_rad=0.2 + 0.6 * THERE_AND_BACK),
     "lift": clip(BOX, path_m=along(2, 0.15 * SMOOTH)),
     "place": clip(BOX, path_m=along(2, -0.15 * SMOOTH)),
     "turn": clip(BOX, turn_rad=np.deg2rad(45) * SMOOTH),

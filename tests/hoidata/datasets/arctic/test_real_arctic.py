@@ -89,7 +89,7 @@ def test_the_hinge_moves_in_recordings_of_use_and_hardly_in_recordings_of_grasps
     for name in ("s01/box_use_01", "s01/box_grab_01"):
         clips = ArcticAdapter(clips="segments").load(RawTree(ROOT), SequenceKey("arctic", "s01", name), hands)
         verbs = [derive_verb(clip, evidence_of(clip, hands)).verb for clip in clips if isinstance(clip, Clip)]
-        fractions.append(np.mean([verb in ("open", "close", "operate") for verb in verbs]))
+        fractions.append(np.mean(["open" in verb or "close" in verb for verb in verbs]))
     assert fractions[0] > 0.3
     assert fractions[1] == 0
 
