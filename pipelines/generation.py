@@ -75,7 +75,7 @@ def generate_files(request: GenerationRequest, out: Path) -> WrittenFiles:
     wording = _wording(request)
     verb, noun = wording.verb, wording.noun
     models, reason = (request.models, "") if request.models else _project_models(request, verb, noun)
-    notes += [*wording.notes, *([reason] if reason else [])]
+    notes += [*wording.notes, *([reason] if reason else []), *_preset_notes(models.checkpoints)]
     make_repeatable(threads=1)  # one motion is too small to gain from two threads
     hands = models.hands
     model = user.model if user else _stored_object(str(request.object), models)
@@ -98,6 +98,19 @@ def generate_files(request: GenerationRequest, out: Path) -> WrittenFiles:
         notes += [f"never seen: {note}" for note in evidence["unseen"]]
     notes += [*_further_verb_notes(wording.text, verb, generator.vocabulary), *_fault_notes(motions)]
     return WrittenFiles(write_generation(out, motions, hands, str(models.checkpoints), notes), notes)
+
+
+def _preset_notes(checkpoints: Path) -> list[str]:
+    """A note if the networks were trained with different presets or sizes."""
+    presets = {}
+    for name in NAMES:
+        record = read_info(checkpoints / name / FILE_NAME).get("provenance") or {}
+        params = record.get("stages", {}).get(record.get("stage"), {}).get("params", {})
+        presets[name] = " ".join(key.split(".")[1] for key in sorted(params) if key.endswith(f".{name}"))
+    if len(set(presets.values())) == 1:
+        return []
+    listed = ", ".join(f"{name} {preset or 'unknown'}" for name, preset in presets.items())
+    return [f"networks of different presets or sizes: {listed}; `hoidata repro` trains them alike"]
 
 
 def _missing_hinge_notes(verb: str | None, object: str | Path, model: ObjectModel) -> list[str]:

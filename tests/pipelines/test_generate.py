@@ -15,6 +15,7 @@ from hoidata.objects.user_mesh import read_user_object
 from models.common.checkpoints import FILE_NAME
 from models.text2hoi.generation import MotionOptions
 from models.text2hoi.sampler import SamplingConfig
+from pipelines import generation
 from pipelines.cli import app
 from pipelines.generation import (
     GenerationRequest,
@@ -253,3 +254,18 @@ def test_a_request_needs_only_the_networks_that_it_uses(tmp_path: Path, monkeypa
     assert "length" in (why_not_trained(paths, needed["length"][1]) or "")
     assert "refiner" in (why_not_trained(paths, needed["no length"][1]) or "")
     assert why_not_trained(paths, needed["neither"][1]) is None
+
+
+def test_networks_of_different_presets_are_named(monkeypatch):
+    def info(path: Path) -> dict:
+        name = path.parent.name
+        preset = presets.get(name, "ours")
+        params = dict.fromkeys((f"train.{preset}.{name}", "train.seed", f"train.small.{name}"))
+        return {"provenance": {"stage": "train", "stages": {"train": {"params": params}}}}
+
+    monkeypatch.setattr(generation, "read_info", info)
+    presets = {}
+    assert generation._preset_notes(Path()) == []
+    presets = {"refiner": "paper"}
+    (note,) = generation._preset_notes(Path())
+    assert "contact ours small, length ours small, diffusion ours small, refiner paper small" in note
