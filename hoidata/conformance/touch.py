@@ -174,7 +174,7 @@ def _flexion_rad(clip: Clip, side: Side, hands: HandPair) -> float:
 
 def _alternative_readings(clips: list[Clip], touches: list[_Touch], hands: HandPair) -> Finding:
     """Whether another interpretation of the same numbers brings the fingertips much closer to the object."""
-    rule, problems = "no other interpretation of the numbers brings the fingertips closer", []
+    rule, problems = "no other interpretation of the numbers brings the fingertips closer", dict[str, float]()
     n_frames = sum(int(np.isfinite(touch.tips_m).any(axis=0).sum()) for touch in touches)
     if few := _too_few(rule, "with a hand", n_frames):
         return few
@@ -185,8 +185,9 @@ def _alternative_readings(clips: list[Clip], touches: list[_Touch], hands: HandP
         as_read_m, alternative_m = np.mean(pairs, axis=0)
         agrees = [alternative < MAX_BETTER_RATIO * as_read for as_read, alternative in pairs if as_read or alternative]
         if alternative_m < MAX_BETTER_RATIO * as_read_m and sum(agrees) > 1:  # a single clip may agree by chance
-            problems.append(f"{alternative_m * 1e3:.0f} mm in place of {as_read_m * 1e3:.0f} mm {reading_in_words}")
-    return finding(rule, problems, "warn")
+            problem = f"{alternative_m * 1e3:.0f} mm in place of {as_read_m * 1e3:.0f} mm {reading_in_words}"
+            problems[problem] = alternative_m / as_read_m
+    return finding(rule, sorted(problems, key=problems.__getitem__), "warn")  # a finding shows the first ones only
 
 
 def _paired(touch: _Touch, other: _Touch) -> tuple[float, float]:
