@@ -80,10 +80,7 @@ def table(
     ],
     metrics: Annotated[str, typer.Option(help="Names of metrics (hoidata/metrics/README.md), separated by commas.")],
 ) -> None:
-    """Print metrics of all families and controls as a Markdown table.
-
-    It marks metrics worse than retrieval, and methods whose motions or networks have changed since they were measured.
-    """
+    """Print metrics of all methods as a Markdown table; mark stale ones and those worse than retrieval."""
     from pipelines.lineage.locks import outdated_samples
     from pipelines.pages.metrics_table import markdown_table
 
