@@ -131,7 +131,7 @@ def test_saving_takes_a_fiftieth_of_the_time_at_most(tmp_path: Path, monkeypatch
 def test_a_line_has_step_loss_and_time_left_and_lines_become_rarer(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
 ) -> None:
-    """One second per step, after step 100 of a resumed training: a line after 5 s, later after a fiftieth of the time."""
+    """One second per step of a training resumed after step 100: lines after 5 s, later after a fiftieth of the time."""
     clock = SimpleNamespace(monotonic=lambda: clock.now, now=0.0)
     monkeypatch.setattr("models.common.progress.time", clock)
     line = Line(100, 3700)
