@@ -84,7 +84,7 @@ def test_a_field_has_the_distance_of_a_sphere() -> None:
 
 
 def test_a_field_rotates_the_moving_part_with_the_hinge(batch: ClipBatch, hands: Hands) -> None:
-    surface = Surface.of(hands, batch.objects, 40, torch.device("cpu"))
+    surface = Surface.of(hands, batch.objects, torch.device("cpu"))
     points = place_points(batch, batch.object)
     both_hands = points[:, None].expand(-1, 2, -1, -1, -1)
     _, distance, _ = surface.measure(batch, both_hands, batch.object)

@@ -128,7 +128,11 @@ CHANGES = (
         "report; annotate, contact, controls, convert, evaluate, evaluator, quality, raw, sample, split, train, "
         "train-diffusion, train-refiner of toy",
     ),
-    Change("the sentences: `hoidata/annotation/sentences.py`", touch("hoidata/annotation/sentences.py"), "annotate"),
+    Change(
+        "the sentences: `hoidata/annotation/sentences.py`",
+        touch("hoidata/annotation/sentences.py"),
+        "annotate, sample (other-prompt, text2hoi, text2hoi-coarse)",
+    ),
     Change(
         "conformance kit, store checks, lineage, docs",
         touch("hoidata/conformance/check.py", "hoidata/store_check/check.py", "pipelines/lineage/tree.py", "README.md"),
