@@ -90,12 +90,11 @@ def gap_of(track: HandTrack, frames: slice) -> Gap:
     return Gap(int(first), int(stop), before, after)
 
 
-def predict_fingers(predictor: Predictor, hand: TrackedHand, side: Side, control: Control, gap: Gap,
-                seam_s: float = SEAM_S) -> np.ndarray:  # fmt: skip
+def predict_fingers(predictor: Predictor, hand: TrackedHand, side: Side, control: Control, gap: Gap) -> np.ndarray:
     """Predict finger rotations (frame, joint - 1, 3, 3) of a gap.
 
     The prediction starts at the pose before the gap, or at the neutral pose. It is blended to the poses before and
-    after the gap over ``seam_s``.
+    after the gap over ``SEAM_S``.
 
     Args:
         predictor: the network.
@@ -103,14 +102,13 @@ def predict_fingers(predictor: Predictor, hand: TrackedHand, side: Side, control
         side: of the hand.
         control: wrists and object at 30 fps.
         gap: the frames to fill.
-        seam_s: duration of the blend.
     """
     known_frames = int(gap.before is not None)
     start = hand.rest_rotmats if gap.before is None else gap.before
     time_s = control.object_motion.time_s[gap.first - known_frames : gap.stop]
     task = RolloutTask(hand=hand, side=side, control=control, time_s=time_s, start=start)
     (predicted,) = roll_out(predictor, [task])
-    return blend_ends(predicted[known_frames:], gap.before, gap.after, round(seam_s * FPS))
+    return blend_ends(predicted[known_frames:], gap.before, gap.after, round(SEAM_S * FPS))
 
 
 def interpolate_fingers(gap: Gap) -> np.ndarray:
