@@ -75,7 +75,7 @@ def generate_files(request: GenerationRequest, out: Path) -> WrittenFiles:
     wording = _wording(request)
     verb, noun = wording.verb, wording.noun
     models, reason = (request.models, "") if request.models else _project_models(request, verb, noun)
-    notes += [*wording.notes, *([reason] if reason else []), *_preset_notes(models.checkpoints)]
+    notes += [*wording.notes, *([reason] if reason else []), *_preset_notes(models.checkpoints, _networks(request))]
     make_repeatable(threads=1)  # one motion is too small to gain from two threads
     hands = models.hands
     model = user.model if user else _stored_object(str(request.object), models)
@@ -100,10 +100,10 @@ def generate_files(request: GenerationRequest, out: Path) -> WrittenFiles:
     return WrittenFiles(write_generation(out, motions, hands, str(models.checkpoints), notes), notes)
 
 
-def _preset_notes(checkpoints: Path) -> list[str]:
+def _preset_notes(checkpoints: Path, networks: Sequence[str]) -> list[str]:
     """A note if the networks were trained with different presets or sizes."""
     presets = {}
-    for name in NAMES:
+    for name in networks:
         record = read_info(checkpoints / name / FILE_NAME).get("provenance") or {}
         params = record.get("stages", {}).get(record.get("stage"), {}).get("params", {})
         presets[name] = " ".join(key.split(".")[1] for key in sorted(params) if key.endswith(f".{name}"))

@@ -257,6 +257,8 @@ def test_a_request_needs_only_the_networks_that_it_uses(tmp_path: Path, monkeypa
 
 
 def test_networks_of_different_presets_are_named(monkeypatch):
+    names = ["contact", "length", "diffusion", "refiner"]
+
     def info(path: Path) -> dict:
         name = path.parent.name
         preset = presets.get(name, "ours")
@@ -265,7 +267,7 @@ def test_networks_of_different_presets_are_named(monkeypatch):
 
     monkeypatch.setattr(generation, "read_info", info)
     presets = {}
-    assert generation._preset_notes(Path()) == []
+    assert generation._preset_notes(Path(), names) == []
     presets = {"refiner": "paper"}
-    (note,) = generation._preset_notes(Path())
+    (note,) = generation._preset_notes(Path(), names)
     assert "contact ours small, length ours small, diffusion ours small, refiner paper small" in note
