@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from hoidata.batches.dataset import MAX_FRAMES
+from hoidata.batches.requests import RequestBatch
 from hoidata.clips import HandTrack
 from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from hoidata.contact.settings import ContactSettings
@@ -161,19 +162,25 @@ class TestText2Hoi:
         model = DiffusionModel(DiffusionConfig(transformer=small)).eval()
         shapes: list[tuple[int, ...]] = []
         model.encoder.register_forward_pre_hook(lambda _, inputs: shapes.append(tuple(inputs[0].shape)))
-        condition = Condition(
+        batch = RequestBatch(
+            objects=(),
             text=torch.ones(1, 512),
-            object=torch.zeros(1, 1024),
             points_m=torch.rand(1, 1024, 3),
             normals=torch.rand(1, 1024, 3),
             part=torch.zeros(1, 1024, dtype=torch.long),
             scale_m=torch.ones(1),
-            contact=torch.zeros(1, 2, 1024),
             active_hands=torch.ones(1, 2, dtype=torch.bool),
+            frames=torch.ones(1, 150, dtype=torch.bool),
             lengths=torch.tensor([150]),
             counts=(150,),
             sides=(True, True),
+            betas=torch.zeros(1, 2, 10),
+            template_m=None,
+            hinge_axis=torch.zeros(1, 3),
+            hinge_origin_m=torch.zeros(1, 3),
+            articulated=torch.zeros(1, dtype=torch.bool),
         )
+        condition = Condition(batch, batch.text, [None], torch.zeros(1, 2, 1024))
         with torch.no_grad():
             steps = torch.zeros(1, dtype=torch.long)
             hands, objects = model(torch.zeros(1, 2, 150, 99), torch.zeros(1, 150, 10), steps, condition)

@@ -95,7 +95,7 @@ def planned(params: Path, network: str) -> None:
     ("keys", "value", "key", "words"),
     [
         ("train.small.length.training.learning_rate", "fast", None, "expected float, got 'fast'"),
-        ("train.ours.length.network.verb_count", "loud", None, "expected int, got 'loud'"),
+        ("train.ours.length.network.verb_input", "loud", None, "expected bool, got 'loud'"),
         ("profiles.embedded.train.small.length.training.batch", 1.5, None, "expected int, got 1.5"),
         ("train.small.length.training.steps", 0, None, "expected 1 or more, got 0"),
         ("train.small.length.training.stepps", 3, "train.small.length.training", "expected keys among: .*got stepps"),

@@ -18,9 +18,8 @@ from hoidata.sensors.part_bps import BasisSettings
 from models.bimart.family import BimArtSampler, FamilyConfig
 from models.bimart.hands import HandSamplingOptions, SampledHands, hands_for
 from models.bimart.network import ContactModel, DenoiserConfig, MotionModel
-from models.bimart.sampler import OURS, BimArt
+from models.bimart.sampler import OURS, BimArt, BimArtSamplerConfig
 from models.bimart.scene import FeatureConfig
-from models.common.sampling import SamplerConfig
 from models.common.transformer import TransformerConfig
 from pipelines.pages.hands_page import ARRAYS, write_hands
 from tests.builders.objects import hinged_box
@@ -51,7 +50,7 @@ def sampler() -> BimArtSampler:
         motion.keypoint_ids.copy_(torch.from_numpy(ids))
         contact.mean.fill_(0.02)
         contact.scale.fill_(0.005)
-    sampling = replace(OURS, sampler=SamplerConfig("ddim", 2, 0.5))
+    sampling = replace(OURS, sampler=BimArtSamplerConfig("ddim", 2, 0.5))
     model = BimArt(contact.eval(), motion.eval(), sampling, torch.device("cpu"))
     return BimArtSampler(model, PAIR, FamilyConfig(), synthetic=True)
 
