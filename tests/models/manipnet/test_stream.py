@@ -16,7 +16,7 @@ from hoidata.sensors.mano_hand import mano_hand
 from models.manipnet.control import Control, Motion
 from models.manipnet.features import FeatureSettings
 from models.manipnet.network import NetworkConfig
-from models.manipnet.rollout import Predictor, RolloutTask, Rule, roll_out
+from models.manipnet.rollout import Predictor, RolloutTask, roll_out
 from models.manipnet.stream import Stream, TrackedFrame
 from models.manipnet.training import NETWORK_ARRAYS, build_network, hand_examples, perturbed_poses, step_loss
 from tests.builders.objects import box_model
@@ -260,10 +260,9 @@ def test_a_stream_survives_each_fault_and_recovers_within_half_a_second(trained:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("length_s", "rule"), [(30.0, "ours"), (1800.0, "off")])  # half an hour is faster without
-def test_a_stream_survives_random_faults(trained: Predictor, length_s: float, rule: Rule) -> None:
-    control, faults, model = tracked(TRACKER_HZ, length_s), random_faults(0, length_s), replace(trained, rule=rule)
-    assert_survived(streamed(model, control)[0], poses_with_faults(model, control, faults), faults)
+def test_a_stream_survives_half_a_minute_of_random_faults(trained: Predictor) -> None:
+    control, faults = tracked(TRACKER_HZ, 30.0), random_faults(0, 30.0)
+    assert_survived(streamed(trained, control)[0], poses_with_faults(trained, control, faults), faults)
 
 
 def test_lost_fingers_are_kept_and_the_other_hand_goes_on(trained: Predictor) -> None:
