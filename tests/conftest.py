@@ -12,6 +12,11 @@ from types import SimpleNamespace
 import pytest
 from filelock import FileLock
 
+from hoidata.processor import portable_kernels
+
+# Before numpy is loaded: the kernels of the commands, so that fixtures have the bytes of the stages.
+os.environ.update(portable_kernels())
+
 from hoidata.clips import Clip
 from tests.builders.clips import build_clip
 

@@ -54,7 +54,7 @@ def study_clips(dataset: str, object_index: int, verbs: Sequence[str]) -> list[C
                     source_key=subject,
                     left=number % 2 == 1,
                 )
-                truth = make_study_sequence(scenario, contact_frames, pair, rng)
+                truth = make_study_sequence(scenario, contact_frames, pair, 1.0, rng)
                 clip = truth.take(truth.clip_frames)
                 name = f"{dataset}/{subject}/{study_object.spec.name}_{verb}_{number}"
                 facts = {"verb": verb, "object_words": study_object.spec.words}

@@ -46,7 +46,7 @@ def test_six_real_sequences_go_from_raw_files_to_a_report_and_a_second_run_does_
     params["convert"]["adapters"]["arctic"] = {"clips": "segments"}
     params["split"]["arctic"] = SPLIT
     params["sample"]["samples"] = 1
-    params["sample"]["text2hoi"]["max_attempts"] = 1
+    params["sample"]["text2hoi"]["attempts"] = 1
     params["controls"] = {"families": ["prompt-retrieval"]}
     project_tools.write_params(project, params)
 

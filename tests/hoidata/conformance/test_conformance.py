@@ -85,7 +85,7 @@ def test_the_command_checks_an_adapter_of_another_package(tmp_path: Path, kitche
     module.write_text(module.read_text().replace("clip_id=str(key)", 'clip_id=f"{key}".upper()'))
     bad = run("check", "kitchen", "--root", str(kitchen_root), "--setting", "shortest_frames=5")
     assert bad.returncode == 1
-    assert "does not begin with kitchen/p01/lift_cup_1" in " ".join(bad.stdout.split())
+    assert "does not begin with kitchen/p01/lift_cup_1" in " ".join(bad.stdout.replace("│", " ").split())
     wrong = run("check", "kitchen", "--root", str(kitchen_root), "--setting", "fps=5")
     assert wrong.returncode == 1
     assert "expected some of shortest_frames, got fps" in " ".join(wrong.stderr.split())
