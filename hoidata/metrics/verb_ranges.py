@@ -43,18 +43,18 @@ class VerbRanges:
         """
         index, touching, speeds = ProximityIndex(points), np.zeros((len(SIDES), clip.n_frames), bool), [0.0]
         slips = [np.zeros(0)]
-        for row, side in enumerate(SIDES):
+        for side_index, side in enumerate(SIDES):
             track = clip.hands[side]
             if track.valid.any():
                 joints_m = track_joints(track, self.hands[side])
                 near = index.entries(joints_m, track.valid, clip.object, self.threshold_m)
-                touching[row, near["frame"]] = True
+                touching[side_index, near["frame"]] = True
                 speeds.append(fastest_joint(joints_m, track.valid))
                 part = points.part[near["point"]]
                 touched = touched_parts(clip.n_frames, near["frame"], near["joint"], near["distance_m"], part)
                 slips.append(joint_slips_cm_s(clip.object, joints_m, touched))
-        own = {JOINT_SPEED: max(speeds), SLIP: _mean(np.concatenate(slips))}
-        return action_numbers(clip.object, clip.gravity, touching) | own
+        hand_measures = {JOINT_SPEED: max(speeds), SLIP: _mean(np.concatenate(slips))}
+        return action_numbers(clip.object, clip.gravity, touching) | hand_measures
 
     def is_other(self, verb: str | None, moved_as: str | None) -> bool:
         """Whether a motion has another verb than the requested one; False if either is not known."""
@@ -81,8 +81,8 @@ def training_ranges(store: AnnotatedStore) -> Actions:
         speeds += [fastest_joint(store.joints(clip_id, side), clip.hands[side].valid) for side in SIDES]
         if verb := verb_of(store, clip_id):
             slips.setdefault(verb, []).append({SLIP: _recorded_slip_cm_s(store, clip_id, clip.object)})
-    every = [own[SLIP] for rows in slips.values() for own in rows]
-    scale = {SLIP: (0.0, max(float(np.std(every)), LEAST_DEVIATION_CM_S))} if every else {}
+    all_slips = [measures[SLIP] for clips in slips.values() for measures in clips]
+    scale = {SLIP: (0.0, max(float(np.std(all_slips)), LEAST_DEVIATION_CM_S))} if all_slips else {}
     most_slip = {verb: limits[SLIP][1] for verb, limits in usual_limits(slips, scale).items()}
     # A corpus whose hands never move bounds nothing.
     fastest = {JOINT_SPEED: (0.0, FASTER * max(speeds))} if max(speeds) else {}
@@ -91,13 +91,13 @@ def training_ranges(store: AnnotatedStore) -> Actions:
     return replace(actions, usual={verb: actions.usual.get(verb, {}) | fastest | slip[verb] for verb in slip})
 
 
-def _recorded_slip_cm_s(store: AnnotatedStore, clip_id: str, thing: ObjectTrack) -> float:
+def _recorded_slip_cm_s(store: AnnotatedStore, clip_id: str, track: ObjectTrack) -> float:
     """``SLIP`` of a recorded clip, from its stored distances."""
     part, slips = store.points(store.object_key(clip_id)).part, []
     for side in SIDES:
         near = store.distances(clip_id, side)
-        touched = touched_parts(thing.n_frames, near.frame, near.joint, near.distance_m, part[near.point])
-        slips.append(joint_slips_cm_s(thing, store.joints(clip_id, side), touched))
+        touched = touched_parts(track.n_frames, near.frame, near.joint, near.distance_m, part[near.point])
+        slips.append(joint_slips_cm_s(track, store.joints(clip_id, side), touched))
     return _mean(np.concatenate(slips))
 
 

@@ -52,28 +52,28 @@ def refine_grasps(pair: HandPair, clip: Clip) -> Clip:
 
 def _refined(pair: HandPair, clip: Clip, side: Side, other: Capsules | None) -> HandTrack:
     """One hand after refinement. other: capsules of the other hand, world frame."""
-    track, thing = clip.hands[side], clip.object
+    track, target = clip.hands[side], clip.object
     if not track.valid.any():
         return track
     skin = SkinnedHand(pair[side], np.asarray(track.betas, np.float64)[0], track.template_m)
-    pose, field = HandPose.of(track), ObjectField(thing)
+    pose, field = HandPose.of(track), ObjectField(target)
     points_m = skin.vertices_m(skin.chain(pose))
     touching: np.ndarray = (field.distances(points_m)[0] < NEAR_M) & track.valid[:, None]
     part, touching = field.part_touched(points_m, touching)
-    world_from_grasped = world_from_part(thing, part)
+    world_from_grasped = world_from_part(target, part)
     grasps = _grasps(points_m, np.any(touching, axis=1), world_from_grasped, track.valid)
     if not grasps:
         return track
     part_from_world = world_from_grasped.inverse()
     corrected = HandMotion(
         skin,
-        ObjectField(_in_part(thing, thing.model.object_from_part(part, thing.hinge_rad))),
+        ObjectField(_in_part(target, target.model.object_from_part(part, target.hinge_rad))),
         pose.relative_to(part_from_world),
         grasps,
         track.valid,
         None if other is None else other.relative_to(part_from_world),
         part=part,
-        passed=_passed(thing, grasps),
+        passed=_passed(target, grasps),
     ).corrected()
     refined = corrected.relative_to(world_from_grasped).track(track.mean_betas, track.valid, track.template_m)
     arrays = {
@@ -82,39 +82,39 @@ def _refined(pair: HandPair, clip: Clip, side: Side, other: Capsules | None) -> 
     return replace(track, **{name: np.where(track.valid[:, None], *pair) for name, pair in arrays.items()})
 
 
-def _passed(thing: ObjectTrack, grasps: Sequence[Interval]) -> np.ndarray | None:
+def _passed(target: ObjectTrack, grasps: Sequence[Interval]) -> np.ndarray | None:
     """(frame,) bool: grasps in which one part of an object moves past the other; None where there are none."""
-    hinge_rad, passed = thing.hinge_rad, np.zeros(thing.n_frames, bool)
+    hinge_rad, passed = target.hinge_rad, np.zeros(target.n_frames, bool)
     for start, stop in grasps:
         passed[start:stop] = hinge_rad is not None and np.ptp(hinge_rad[start:stop]) > PASSING_RAD
     return passed if passed.any() else None
 
 
-def _in_part(thing: ObjectTrack, object_from_part: RigidTransform) -> ObjectTrack:
+def _in_part(target: ObjectTrack, object_from_part: RigidTransform) -> ObjectTrack:
     """The object's motion as the part sees it."""
     back = object_from_part.inverse()
-    rotation, place = (
-        np.broadcast_to(array, (thing.n_frames, *array.shape[back.rotation.ndim - 2 :]))
+    rotation, translation = (
+        np.broadcast_to(array, (target.n_frames, *array.shape[back.rotation.ndim - 2 :]))
         for array in (back.rotation, back.translation)
     )
-    return replace(thing, rotvec=rotmat_to_rotvec(rotation), translation_m=place)
+    return replace(target, rotvec=rotmat_to_rotvec(rotation), translation_m=translation)
 
 
 def _grasps(
     points_m: np.ndarray, touching: np.ndarray, world_from_part: RigidTransform, valid: np.ndarray
 ) -> list[Interval]:
     """Intervals in which a hand, vertices (frame, vertex, 3) world, touches (frame,) a part and hardly moves on it."""
-    some = world_from_part.inverse() @ points_m[:, ::20]
-    speed = np.linalg.norm(np.diff(some, axis=0), axis=-1).mean(axis=1) * FPS
-    carried = world_from_part[1:] @ some[:-1] - world_from_part[:-1] @ some[:-1]
+    sampled_m = world_from_part.inverse() @ points_m[:, ::20]
+    speed = np.linalg.norm(np.diff(sampled_m, axis=0), axis=-1).mean(axis=1) * FPS
+    carried = world_from_part[1:] @ sampled_m[:-1] - world_from_part[:-1] @ sampled_m[:-1]
     moving = np.linalg.norm(carried, axis=-1).mean(axis=1) * FPS > MOVING_M_S
     slow = speed < np.where(moving, CARRIED_M_S, STILL_M_S)
     is_grasp = touching & (np.append(slow, False) | np.append(False, slow))
     for start, stop in runs(~is_grasp):
         short = start > 0 and stop < len(is_grasp) and stop - start <= GAP_FRAMES and valid[start:stop].all()
-        if short and np.linalg.norm(some[stop] - some[start - 1], axis=-1).mean() < SAME_M:
+        if short and np.linalg.norm(sampled_m[stop] - sampled_m[start - 1], axis=-1).mean() < SAME_M:
             is_grasp[start:stop] = True
-    return [found for found in runs(is_grasp) if found.stop - found.start >= MIN_FRAMES]
+    return [grasp for grasp in runs(is_grasp) if grasp.stop - grasp.start >= MIN_FRAMES]
 
 
 @one_thread()
@@ -144,8 +144,8 @@ class LiftedObject:
             return cls(None, np.zeros(0, int), field)
         scene = object_scene(clip)
         air = np.flatnonzero(scene.lifted)
-        some = ((np.arange(AIR_FRAMES) + 0.5) * len(air) / AIR_FRAMES).astype(int)
-        return cls(scene, air[some] if len(air) else air, field)
+        evenly = ((np.arange(AIR_FRAMES) + 0.5) * len(air) / AIR_FRAMES).astype(int)
+        return cls(scene, air[evenly] if len(air) else air, field)
 
     def carried_fraction(self, hands: Sequence[Capsules]) -> float:
         """Fraction of the frames in which friction at the contacts of hands can produce the object's motion."""
@@ -159,21 +159,23 @@ class LiftedObject:
 
         Read from the distance grid; ``hoidata.physics.capsules.capsule_contacts`` is exact and far slower.
         """
-        there = np.isfinite(capsules.start_m[..., 0])
+        is_known = np.isfinite(capsules.start_m[..., 0])
         capsules = Capsules(np.nan_to_num(capsules.start_m), np.nan_to_num(capsules.end_m), capsules.radius_m)
         along = np.linspace(0, 1, _ALONG)[:, None]
         axis = (capsules.end_m - capsules.start_m)[:, :, None]
-        places = (capsules.start_m[:, :, None] + along * axis).reshape(len(self.frames), -1, 3)
-        found = self.field.distances(places, self.frames)
+        positions_m = (capsules.start_m[:, :, None] + along * axis).reshape(len(self.frames), -1, 3)
+        nearest = self.field.distances(positions_m, self.frames)
         shape = (*capsules.start_m.shape[:2], _ALONG)
-        distance, slope, place = (array.reshape(*shape, -1) for array in (*found, places))
+        distance, slope, position_m = (array.reshape(*shape, -1) for array in (*nearest, positions_m))
         deepest = distance.argmin(axis=2, keepdims=True)
-        distance, slope, place = (np.take_along_axis(a, deepest, 2)[:, :, 0] for a in (distance, slope, place))
+        distance, slope, position_m = (
+            np.take_along_axis(a, deepest, 2)[:, :, 0] for a in (distance, slope, position_m)
+        )
         # Interpolated gradients are shorter than one at edges, and zero in the middle of a thin object.
         length = np.linalg.norm(slope, axis=-1)
         slope /= np.maximum(length, _LEAST_SLOPE)[..., None]
-        frame, capsule = np.nonzero(there & (distance[..., 0] < capsules.radius_m) & (length > _LEAST_SLOPE))
+        frame, capsule = np.nonzero(is_known & (distance[..., 0] < capsules.radius_m) & (length > _LEAST_SLOPE))
         depth, normal = (capsules.radius_m - distance[..., 0])[frame, capsule], slope[frame, capsule]
-        point = (place - distance * slope)[frame, capsule]
+        point = (position_m - distance * slope)[frame, capsule]
         number = self.frames[frame]
         return CapsuleContacts(number, capsule, np.zeros_like(number), depth, point, normal, point, normal)
