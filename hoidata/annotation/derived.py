@@ -17,6 +17,7 @@ from hoidata.store.hand_evidence import HandEvidence
 # All thresholds are ours. A smaller hinge rotation can be a side effect of the grasp.
 HINGE_RAD = np.deg2rad(15)
 MIN_NET_HINGE_FRACTION = 0.5  # net rotation over range: above it the verb is open or close, below it both
+LEVERS = frozenset({"espressomachine"})  # objects whose hinged part is a lever: it neither opens nor closes them
 # Higher than LIFTED_M is a lift; below RAISED_M the object has not left its support (ManipNet's 1.5 cm).
 LIFTED_M, RAISED_M = 0.10, 0.015
 LOWERED_M = 0.05
@@ -60,6 +61,7 @@ def derive_verb(clip: Clip, evidence: HandEvidence) -> Derived:
 
     - open, close: the hinge rotates by 15 degrees or more, away from or towards zero (closed, in ARCTIC).
     - open and close, close and open: the hinge rotates as far and returns.
+    - operate: as the rules above, if the hinged part is a lever (``LEVERS``).
     - shake: three fast oscillations or more.
     - place: the object ends 5 cm lower than it starts, at rest. Needs ``clip.gravity``, like lift and grasp.
     - lift: the object rises by 10 cm or more.
@@ -73,7 +75,7 @@ def derive_verb(clip: Clip, evidence: HandEvidence) -> Derived:
         evidence: hand distances of the same clip, at the threshold of its hand type.
     """
     motion = object_motion(clip, evidence)
-    height_m, hinge = motion.height_m, _hinge(motion)
+    height_m, hinge = motion.height_m, _hinge(motion, clip.object.model.name)
     highest_m, last_m = (0.0, 0.0) if height_m is None else (float(height_m.max()), float(height_m[-1]))
     if hinge is not None:
         return hinge
@@ -122,12 +124,14 @@ def object_motion(clip: Clip, evidence: HandEvidence) -> ObjectMotion:
     )
 
 
-def _hinge(motion: ObjectMotion) -> Derived | None:
+def _hinge(motion: ObjectMotion, object_name: str) -> Derived | None:
     angle = motion.hinge_rad
     if angle is None or np.ptp(angle) < HINGE_RAD:
         return None
     opened = abs(angle[-1]) - abs(angle[0])
     facts = f"hinge from {angle[0]:.2f} to {angle[-1]:.2f} rad, between {angle.min():.2f} and {angle.max():.2f}"
+    if object_name in LEVERS:
+        return Derived("operate", facts)
     if abs(opened) < MIN_NET_HINGE_FRACTION * np.ptp(angle):
         middle = abs(angle[np.abs(angle - angle[0]).argmax()])
         return Derived("open and close" if middle > abs(angle[0]) else "close and open", facts)

@@ -22,8 +22,8 @@ PHASE = np.linspace(0, 1, FRAMES)
 SMOOTH = PHASE**3 * (10 - 15 * PHASE + 6 * PHASE**2)
 THERE_AND_BACK = np.sin(np.pi * PHASE) ** 2
 
-
 BOX, NOTEBOOK = box_model((0.06, 0.08, 0.2)), notebook()
+LEVER = replace(NOTEBOOK, name="espressomachine")
 
 
 def clip(
@@ -64,6 +64,9 @@ SLIDE = clip(BOX, path_m=along(0, 0.12 * SMOOTH))
 EITHER_WAY = {
     "a hinge leaves zero": (clip(NOTEBOOK, hinge_rad=0.1 + 0.5 * SMOOTH), "open", "close"),
     "a hinge leaves zero downwards": (clip(NOTEBOOK, hinge_rad=-0.1 - 0.5 * SMOOTH), "open", "close"),
+    "a lever turns": (clip(LEVER, hinge_rad=0.1 + 0.5 * SMOOTH), "operate", "operate"),
+    "a lever turns and comes back": (clip(LEVER, hinge_rad=0.2 + 0.6 * THERE_AND_BACK), "operate", "operate"),
+    "a lever hardly turns": (clip(LEVER, hinge_rad=0.2 + 0.2 * SMOOTH), "touch", "touch"),
     "a hinge comes back": (clip(NOTEBOOK, hinge_rad=0.2 + 0.6 * THERE_AND_BACK), *["open and close"] * 2),
     "an open hinge comes back": (clip(NOTEBOOK, hinge_rad=0.8 - 0.6 * THERE_AND_BACK), *["close and open"] * 2),
     "a hinge turns by 11 degrees": (clip(NOTEBOOK, hinge_rad=0.2 + 0.2 * SMOOTH), "touch", "touch"),
