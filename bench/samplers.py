@@ -6,6 +6,7 @@ mask. Its 1,000 calls are extrapolated from a few. Weights are random.
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,9 +16,11 @@ from torch import Tensor, nn
 from bench.harness import medians, show
 from hoidata.batches.requests import ObjectPoints, Request, collate_requests
 from hoidata.objects.model import ObjectModel
+from hoidata.settings import build_config
 from models.common.sampling import SamplerConfig, sample_motion
 from models.common.transformer import TransformerConfig
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
+from pipelines.params import load_yaml
 
 FRAMES, STOCK_STEPS, RUNS = 150, 1000, 3
 
@@ -41,10 +44,21 @@ def main() -> None:
         show("One call of the denoiser, one motion", ["call", "processor ms", "relative to the first"], rows)
         stock_s = times["stock encoder, 451 tokens masked"].processor * STOCK_STEPS
         rows = [["stock encoder, 1,000 masked steps (scaled)", f"{stock_s:.1f}", "1"]]
-        for kind, steps in (("ddim", 50), ("dpm++", 20)):
-            seconds = motion_s(model, SamplerConfig(kind, steps))
-            rows.append([f"{kind}, {steps} steps", f"{seconds:.1f}", f"{stock_s / seconds:.0f}"])
-        show("One motion of 150 frames and both hands", ["sampler", "processor s", "speed-up"], rows)
+        ours = DiffusionModel(ours_config()).eval()
+        for name, network, kind, steps in (
+            ("paper, ddim", model, "ddim", 50),
+            ("paper, dpm++", model, "dpm++", 20),
+            ("ours, ddim", ours, "ddim", 20),
+        ):
+            seconds = motion_s(network, SamplerConfig(kind, steps))
+            rows.append([f"{name}, {steps} steps", f"{seconds:.2f}", f"{stock_s / seconds:.0f}"])
+        show("One motion of 150 frames and both hands", ["preset and sampler", "processor s", "speed-up"], rows)
+
+
+def ours_config() -> DiffusionConfig:
+    """The settings of the preset `ours` in params.yaml."""
+    changes = load_yaml(Path("params.yaml").read_bytes())["train"]["ours"]["diffusion"]["network"]
+    return build_config(DiffusionConfig, changes, "params.yaml: train.ours.diffusion.network")
 
 
 def stock_encoder(size: TransformerConfig) -> nn.TransformerEncoder:
@@ -82,15 +96,12 @@ def one_call(model: DiffusionModel, active: tuple[bool, bool], frames: int) -> C
     return lambda: model.denoise(hands, objects, steps, encoded)
 
 
-def run(model: DiffusionModel, config: SamplerConfig) -> Tensor:
-    """Sample the hands of one motion from fixed noise."""
-    generator = torch.Generator().manual_seed(0)
-    noise = torch.randn(1, 2, FRAMES, 99, generator=generator), torch.randn(1, FRAMES, 10, generator=generator)
-    encoded = model.encode_condition(condition((True, True), FRAMES))
-    return sample_motion(lambda *inputs: model.denoise(*inputs, encoded), noise, config, generator)[0]
-
-
 def motion_s(model: DiffusionModel, config: SamplerConfig) -> float:
+    """Processor seconds of the denoising of one motion from fixed noise."""
+    generator, (hand_points, object_points) = torch.Generator().manual_seed(0), model.representation.sizes(FRAMES)
+    hands = torch.randn(1, 2, hand_points, 99, generator=generator)
+    objects = torch.randn(1, object_points, model.representation.object_features, generator=generator)
     start = time.process_time()
-    run(model, config)
+    encoded = model.encode_condition(condition((True, True), FRAMES))
+    sample_motion(lambda *inputs: model.denoise(*inputs, encoded), (hands, objects), config, generator)
     return time.process_time() - start
