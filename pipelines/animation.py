@@ -12,6 +12,7 @@ import torch
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, Side
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
+from hoidata.metrics.verdict import summary, verdict, verdict_lines
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.annotated import load_annotated
@@ -33,7 +34,7 @@ from models.manipnet.network import ManipNet
 from models.manipnet.rollout import Predictor, Rule
 from models.manipnet.training import MANIPNET
 from models.manipnet.trajectory_files import ENDINGS, Axes, TrajectoryFile, read_trajectories
-from pipelines.command_inputs import MeshOptions, ProjectData, stored_object, trained_on, trained_run
+from pipelines.command_inputs import MeshOptions, ProjectData, WrittenFiles, stored_object, trained_on, trained_run
 from pipelines.pages.motion_files import ARRAYS as SHARED
 from pipelines.pages.motion_files import MotionFiles, hand_shapes, motion_arrays, simplified_for_page, write_motions
 from pipelines.pages.player import motion_player
@@ -118,12 +119,14 @@ class Animation:
 
 def animate_files(
     source: str, options: AnimationOptions, profile: str, datasets: tuple[str, ...], out: Path
-) -> list[Path]:
+) -> WrittenFiles:
     """Animate a stored clip (its id) or a file of trajectories (its path), and write the result into ``out``."""
     animation = animate(source, options, profile, datasets)
     clip, hands, ghosts = animation.clip, animation.hands, animation.ghosts
+    sides: list[Side] = [side for side, made in zip(SIDES, animation.generated, strict=True) if made.any()]
+    checks = verdict(clip, hands, sides=sides)
     length = ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s")
-    return write_motions(
+    paths = write_motions(
         out,
         "animation.html",
         [MotionFiles(clip, motion_arrays(clip, hands) | {"made": animation.generated}, ghosts=ghosts)],
@@ -134,7 +137,9 @@ def animate_files(
         notes=animation.notes,
         player=motion_player(simplified_for_page(clip), hands, clip.clip_id, ghosts=ghosts),
         facts=[*animation.facts, length, ("hand model", hands.name)],
+        verdicts=[("", summary(checks), checks)],
     )
+    return WrittenFiles(paths, animation.notes, verdict_lines(0, checks))
 
 
 def animate(source: str, options: AnimationOptions, profile: str, datasets: tuple[str, ...]) -> Animation:

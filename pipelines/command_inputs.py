@@ -38,6 +38,7 @@ class WrittenFiles:
 
     paths: list[Path]
     notes: list[str]  # assumptions, choices and unknown words, to print for the user
+    verdict: list[str]  # lines on each motion, likewise
 
 
 def stored_object(name: str, clips: Path, hands: HandPair) -> ObjectModel:

@@ -16,13 +16,14 @@ from hoidata.annotation.wording import Wording, understood_words
 from hoidata.contact.settings import ContactSettings
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
+from hoidata.metrics.verdict import verdict_lines
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import piece_names, read_user_object
 from hoidata.settings import build_config
 from hoidata.store.store import open_store
 from models.common.checkpoints import FILE_NAME, read_info
 from models.common.repeatable import make_repeatable
-from models.text2hoi.generation import GeneratedMotion, Generator, MotionOptions
+from models.text2hoi.generation import Generator, MotionOptions
 from models.text2hoi.sampler import SamplingConfig
 from pipelines.command_inputs import MeshOptions, WrittenFiles, mesh_notes, stored_object
 from pipelines.pages.generation_page import write_generation
@@ -88,7 +89,9 @@ def generate_files(request: GenerationRequest, out: Path) -> WrittenFiles:
         points=models.points,
     )
     generator = replace(generator, model=generator.model.with_sampler(**request.sampler))
-    motions = generator.generate(wording.text, model, request.options, noun if user else None)
+    ups = generator.model.object_ups
+    in_training = user is None and (not ups or model.name in ups)
+    motions = generator.generate(wording.text, model, request.options, noun if user else None, in_training)
     evidence, hand = motions[0].evidence, motions[0].evidence["hand"]
     if hand["source"] != "rule":
         notes.append(f"hand: {hand['hand']}, since {hand['evidence']} (--hand chooses another)")
@@ -96,8 +99,9 @@ def generate_files(request: GenerationRequest, out: Path) -> WrittenFiles:
         notes.append(note)
     if evidence["verb"] is None:
         notes += [f"never seen: {note}" for note in evidence["unseen"]]
-    notes += [*_further_verb_notes(wording.text, verb, generator.vocabulary), *_fault_notes(motions)]
-    return WrittenFiles(write_generation(out, motions, hands, str(models.checkpoints), notes), notes)
+    notes += _further_verb_notes(wording.text, verb, generator.vocabulary)
+    verdicts = [line for motion in motions for line in verdict_lines(motion.evidence["number"], motion.verdict)]
+    return WrittenFiles(write_generation(out, motions, hands, str(models.checkpoints), notes), notes, verdicts)
 
 
 def _preset_notes(checkpoints: Path, networks: Sequence[str]) -> list[str]:
@@ -152,12 +156,6 @@ def _further_verb_notes(text: str, verb: str | None, vocabulary: Vocabulary) -> 
         return []
     others = ", ".join(map(repr, further))
     return [f"a motion shows one action: this one shows {verb!r}, not {others}; generate each alone"]
-
-
-def _fault_notes(motions: Sequence[GeneratedMotion]) -> list[str]:
-    """A note per visible fault of a sample."""
-    samples = (motion.evidence for motion in motions)
-    return [f"sample {evidence['number'] + 1}: {fault}" for evidence in samples for fault in evidence["faults"]]
 
 
 def _project_models(request: GenerationRequest, verb: str | None, noun: str | None) -> tuple[Models, str]:

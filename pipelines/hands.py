@@ -1,6 +1,7 @@
 """`hoidata hands`: hand motions for an object motion from keyframes, a clip or a generated motion (BimArt)."""
 
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from os.path import isfile  # returns False for a name that is too long, where Path.is_file raises
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +17,8 @@ from hoidata.errors import BadInput
 from hoidata.files import sha256_file
 from hoidata.files.numpy_files import load_npz_arrays
 from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.metrics.unmeasured import Unmeasured
+from hoidata.metrics.verdict import UNKNOWN_UP, verdict, verdict_lines
 from hoidata.object_paths import keyframed_path, read_keyframes
 from hoidata.object_paths.path import MAX_S, PathStep, check_pace
 from hoidata.objects.model import Hinge, ObjectModel
@@ -23,7 +26,7 @@ from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import Store, open_store
 from models.bimart.family import BIMART, BimArtSampler
-from models.bimart.hands import HandSamplingOptions, SampledHands, hands_for
+from models.bimart.hands import HandSamplingOptions, hands_for
 from models.common.checkpoints import FILE_NAME, read_info
 from models.common.family import Sources
 from models.common.repeatable import make_repeatable
@@ -73,6 +76,7 @@ class ObjectMotion(NamedTuple):
     steps: tuple[PathStep, ...]  # of a path from keyframes
     source: str  # in words
     notes: list[str]
+    up: np.ndarray | Unmeasured = UNKNOWN_UP  # (3,) direction of the object that is up when it stands, object frame
 
 
 def hands_files(options: HandsOptions, profile: str, datasets: tuple[str, ...], out: Path) -> WrittenFiles:
@@ -91,8 +95,11 @@ def hands_files(options: HandsOptions, profile: str, datasets: tuple[str, ...], 
     digests = {str(path): sha256_file(path) for path in files}
     training_data = trained_on(read_info(paths.checkpoints / BIMART.uses[-1] / FILE_NAME)["facts"])
     facts = [("object's motion", motion.source), ("networks", f"{paths.checkpoints} (trained on {training_data})")]
-    notes = [*motion.notes, *_notes(samples)]
-    return WrittenFiles(write_hands(out, samples, project.hands, motion.steps, digests, facts, notes), notes)
+    notes = [*motion.notes, *mesh_notes(motion.track.model)]
+    checks = [verdict(sample.clip, project.hands, motion.up) for sample in samples]
+    paths = write_hands(out, samples, project.hands, motion.steps, digests, facts, checks, notes)
+    lines = [verdict_lines(sample.number, one) for sample, one in zip(samples, checks, strict=True)]
+    return WrittenFiles(paths, notes, list(chain.from_iterable(lines)))
 
 
 def object_motion(options: HandsOptions, project: ProjectData) -> ObjectMotion:
@@ -126,16 +133,6 @@ def chosen_networks(model: str, project: ProjectData) -> tuple[StagePaths, BimAr
     annotated = load_annotated(paths.data, project.hands)
     sources = Sources(annotated, paths.checkpoints, project.hands, torch.device("cpu"))
     return paths, BimArtSampler.load(sources)
-
-
-def _notes(samples: list[SampledHands]) -> list[str]:
-    """Notes on the mesh (open, repaired), and on hands that never touch the object."""
-    notes = mesh_notes(samples[0].clip.object.model)
-    for sample in samples:
-        idle = [side for side, touching in sample.standing.touching.items() if not touching.any()]
-        if idle:
-            notes.append(f"sample {sample.number + 1}: the {' and the '.join(idle)} hand touches nothing")
-    return notes
 
 
 class _MovableObject(NamedTuple):
@@ -208,7 +205,8 @@ def _keyframed_motion(options: HandsOptions, project: ProjectData, wish: HandSam
     keys = read_keyframes(options.keyframes)
     path = keyframed_path(movable.model, keys, movable.hinge_limits_rad, options.keyframes, movable.rest_rotation)
     source = f"keyframes of {Path(options.keyframes).name}"
-    return ObjectMotion(path.track, wish, steps=path.steps, source=source, notes=movable.notes)
+    up = np.array([0.0, 0.0, 1.0]) if movable.rest_rotation is None else movable.rest_rotation[2]
+    return ObjectMotion(path.track, wish, steps=path.steps, source=source, notes=movable.notes, up=up)
 
 
 def _clip_motion(options: HandsOptions, project: ProjectData, wish: HandSamplingOptions) -> ObjectMotion:

@@ -4,22 +4,18 @@ A few measures describe how the object moves (``hoidata.actions``), how fast the
 joints slip. No test clip and no trained evaluator is involved.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from hoidata.actions.action import Actions, action_numbers, training_actions, usual_limits, verb_of
 from hoidata.batches.requests import ObjectPoints
-from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack, Side
+from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack
 from hoidata.clips.slip import joint_slips_cm_s, touched_parts
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import HandPair, track_joints
-from hoidata.objects.surface_index import SurfaceIndex, surface_index
 from hoidata.refinement import carried_fraction
 from hoidata.store.annotated import AnnotatedStore
-from hoidata.surface.contact import HandInObjectFrame, deepest_m, hand_in_object_frame
 
 JOINT_SPEED = "joint_m_s"
 FASTER = 1.1  # than in any training clip
@@ -109,81 +105,3 @@ def fastest_joint(joints_m: np.ndarray, valid: np.ndarray) -> float:
     """Speed in m/s of the fastest joint (F, 21, 3) between two frames that are ``valid`` (F,)."""
     steps = np.linalg.norm(np.diff(joints_m.astype(np.float64), axis=0), axis=2)[valid[1:] & valid[:-1]]
     return float(steps.max(initial=0.0)) * FPS
-
-
-GAP_M = 0.01  # between skin and surface: a larger gap is visible
-DEEP_M = 0.02  # a finger's thickness
-FLOATING_M = 0.02  # above the start: the object is in the air
-MIN_FRAMES = 3  # a tenth of a second; a shorter fault is not visible
-# An object that moves less does not move.
-STILL = {"path_m": 0.01, "tilt_deg": 5.0, "turn_deg": 5.0, "hinge_max_deg": 5.0}
-MOVES = {"path_m": 0.05, "hinge_max_deg": 10.0}  # of the mean training clip of a verb that moves its object
-
-
-def visible_faults(
-    clip: Clip, hands: HandPair, ranges: VerbRanges | None, verb: str | None, numbers: Mapping[str, float]
-) -> tuple[str, ...]:
-    """What a viewer sees to be wrong, in words: hands that never touch the object, are deep inside it or release it in
-    the air, a motionless object, and measures far outside the range of the verb's training clips.
-
-    Args:
-        ranges: of the training clips; None if the networks have none.
-        verb: the requested verb; None if not known.
-        numbers: ``VerbRanges.numbers``.
-    """
-    index = surface_index(clip.object.model)
-    active: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
-    placed: dict[Side, HandInObjectFrame] = {side: hand_in_object_frame(clip, side, hands) for side in active}
-    gaps: dict[Side, np.ndarray] = {side: _gap_m(hand, index) for side, hand in placed.items()}
-    faults = [*_contact_faults(clip, gaps), *_depth_faults(placed, index)]
-    if ranges is not None and verb is not None:
-        moved_as, visible = ranges.actions.nearest_verb(numbers), ranges.actions.visibly_unusual(verb, numbers)
-        if _is_still(numbers) and _moves_its_object(ranges.actions, verb):
-            faults.append("the object does not move")
-        elif visible:
-            other = f", more like {moved_as!r}" if ranges.is_other(verb, moved_as) else ""
-            faults.append(f"unlike {verb!r} in training{other}: {', '.join(visible)}")
-    return tuple(faults)
-
-
-def _gap_m(hand: HandInObjectFrame, index: SurfaceIndex) -> np.ndarray:
-    """(frame,) metres from the skin to the surface, infinite without the hand."""
-    return hand.expand_to_clip(index.distance_m(hand.vertices_m, hand.hinge_rad).min(axis=1), np.inf)
-
-
-def _contact_faults(clip: Clip, gap_m: Mapping[Side, np.ndarray]) -> list[str]:
-    distances = {side: float(gap.min()) for side, gap in gap_m.items() if gap.min() > GAP_M}
-    faults = [f"the {side} hand never touches the object ({gap * 100:.1f} cm away)" for side, gap in distances.items()]
-    if len(distances) < len(gap_m) and clip.gravity is not None:
-        height = -(clip.object.translation_m.astype(np.float64) @ np.asarray(clip.gravity, np.float64))
-        lifted = height - height[0] > FLOATING_M
-        alone = int((lifted & (np.min([*gap_m.values()], axis=0) > GAP_M)).sum())
-        faults += [f"the object is in the air and no hand touches it in {alone} frames"] * (alone >= MIN_FRAMES)
-    return faults
-
-
-def _depth_faults(placed: Mapping[Side, HandInObjectFrame], index: SurfaceIndex) -> list[str]:
-    if not index.is_solid:
-        return []
-    faults = []
-    for side, hand in placed.items():
-        depth = deepest_m(hand, index)
-        if (frames := int((depth > DEEP_M).sum())) >= MIN_FRAMES:
-            deepest = float(np.nanmax(depth)) * 100
-            faults.append(f"the {side} hand is up to {deepest:.1f} cm inside the object in {frames} frames")
-    return faults
-
-
-def _is_still(numbers: Mapping[str, float]) -> bool:
-    return all(numbers[name] < threshold for name, threshold in STILL.items())
-
-
-def _moves_its_object(actions: Actions, verb: str) -> bool:
-    """Whether the mean training clip of a verb moves its object."""
-    if verb not in actions.centroids:
-        return False
-    measures: dict[str, Any] = {
-        name: float(value) * deviation + mean
-        for value, (name, (mean, deviation)) in zip(actions.centroids[verb], actions.scale.items(), strict=True)
-    }
-    return any(measures.get(name, 0.0) > threshold for name, threshold in MOVES.items())

@@ -18,6 +18,7 @@ from hoidata.devices import send
 from hoidata.geometry.rotations import rot6d_to_rotmat
 from hoidata.hands import HandPair
 from hoidata.metrics.verb_ranges import VerbRanges, training_ranges
+from hoidata.metrics.verdict import object_ups
 from models.common import losses
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
@@ -30,6 +31,7 @@ from models.text2hoi.motion_representation import EncodedClip, MotionRepresentat
 
 TOUCH_WEIGHT = 4.0
 ACTIONS = "actions"  # name of the training clips' usual ranges among the results of a checkpoint
+OBJECT_UPS = "object_ups"  # likewise, of ``hoidata.metrics.verdict.object_ups``
 DISTANCE_ENTRIES = 8192  # of a batch, in Eq. 6
 MAX_CACHED_CLIPS = 16_384  # of about 150 kB each, at most
 VALIDATION_STEPS = (100, 300, 500, 700, 900)
@@ -268,5 +270,8 @@ DIFFUSION = Network(
     objective=_diffusion_objective,
     loss=DiffusionLossConfig,
     needs=(CONTACT.name,),
-    results=lambda network, corpus: {ACTIONS: training_ranges(corpus.annotated).record},
+    results=lambda network, corpus: {
+        ACTIONS: training_ranges(corpus.annotated).record,
+        OBJECT_UPS: object_ups(corpus.annotated),
+    },
 )

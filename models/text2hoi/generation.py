@@ -4,6 +4,7 @@ Text2HOI, Sec. 3 and 4.1. A motion is a :class:`Clip` of dataset "generated" in 
 zero in the first frame. All random numbers come from one seed: the same seed gives the same bytes.
 """
 
+from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -18,18 +19,24 @@ from hoidata.annotation.vocabulary import Vocabulary
 from hoidata.annotation.wording import understood_words
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import ObjectPoints, Request, Sentence
-from hoidata.clips.clip import FPS, SIDES, Clip, HandType
+from hoidata.clips.clip import FPS, SIDES, Clip, HandType, Side
+from hoidata.clips.features import upright
 from hoidata.errors import BadInput
 from hoidata.files import sha256_file
-from hoidata.hands import HandPair, load_embedded_hands
-from hoidata.metrics.verb_ranges import visible_faults
-from hoidata.objects.model import ObjectModel
+from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.hands import HandPair, load_embedded_hands, track_joints
+from hoidata.metrics.unmeasured import Unmeasured
+from hoidata.metrics.verdict import UNKNOWN_UP, Check, RequestedVerb, verdict
+from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.objects.sampling import POINT_COUNT, SampledPoints, sample_points
+from hoidata.objects.surface_index import surface_index
 from models.common.checkpoints import FILE_NAME, Checkpoint
 from models.common.family import motion_clip
 from models.text2hoi.diffusion_training import verb_ranges
 from models.text2hoi.length import SHORTEST_FRAMES
 from models.text2hoi.sampler import Answer, SamplingConfig, Text2Hoi
+
+Z = (0.0, 0.0, 1.0)
 
 
 class Evidence(TypedDict):
@@ -47,7 +54,6 @@ class Evidence(TypedDict):
     contact_threshold_m: float
     moved_as: str | None  # the verb whose training clips have the most similar object motion
     unusual: list[str]  # measures outside the range of the verb's training clips, in words
-    faults: list[str]  # what a viewer sees to be wrong, in words
     unseen: list[str]  # what of the text was not in training, in words
     trained_on: dict[str, int]  # training clips by dataset
     synthetic: bool  # whether the training clips are generated
@@ -63,6 +69,7 @@ class GeneratedMotion:
     contact: np.ndarray  # (N,) bool, the contact map that was the condition
     points: SampledPoints  # the N points of the contact map
     evidence: Evidence
+    verdict: tuple[Check, ...]  # what a viewer sees
 
 
 @dataclass(frozen=True)
@@ -124,18 +131,27 @@ class Generator:
         object: ObjectModel,
         options: MotionOptions = MotionOptions(),
         object_words: str | None = None,
+        in_training: bool = False,
     ) -> list[GeneratedMotion]:
-        """Motions for an English sentence on ``object`` (metres, z up).
+        """Motions for an English sentence on ``object`` (metres).
 
-        Raises BadInput if the text is not an English sentence, and for a length outside of 8 to 150 frames.
+        Args:
+            in_training: whether the object is one of the training clips, in the same frame. Other objects are z up. The
+                networks see them with the axis up that is up in most training clips.
+
+        Raises:
+            BadInput: the text is not an English sentence, or the length is not within 8 to 150 frames.
         """
         wording = understood_words(text, self.vocabulary, lambda: self.encoder, force=True)
         hand = self._hand(text, options)
-        cloud = sample_points(object, self.points)
+        cloud, turn = (
+            sample_points(object, self.points),
+            np.eye(3, dtype=np.float32) if in_training else self._training_from_z_up(),
+        )
         first = Request(
             motion_id=f"generated/{object.name}",
-            object=object,
-            points=ObjectPoints(cloud.points_m, cloud.normals, cloud.part),
+            object=_turned(object, turn),
+            points=ObjectPoints(cloud.points_m @ turn.T, cloud.normals @ turn.T, cloud.part),
             text=self.encoder.encode([wording.text])[0],
             sentence=Sentence(wording.text, wording.verb, wording.noun),
             active_hands=np.array([hand.hand in (side, "both") for side in SIDES]),
@@ -150,9 +166,34 @@ class Generator:
             # One by one: the last bits of a matrix product depend on how many rows it has.
             answer = self.model.answers([request])[0]
             evidence = self._evidence(request, answer, hand, options, object_words or wording.noun)
-            coarse = motion_clip(request, answer.coarse, answer.object, evidence["synthetic"])
-            motions.append(GeneratedMotion(answer.clip, coarse, answer.touched.numpy(), cloud, evidence))
+            clip, coarse = answer.clip, motion_clip(request, answer.coarse, answer.object, evidence["synthetic"])
+            if not in_training:
+                clip, coarse = (closed_as_stored(_turned_back(one, object, turn), self.hands) for one in (clip, coarse))
+            up = self.model.object_ups.get(object.name) if in_training else Z
+            checks = verdict(
+                clip,
+                self.hands,
+                UNKNOWN_UP if up is None else np.asarray(up),
+                self._requested(wording.verb, clip, cloud),
+            )
+            motions.append(GeneratedMotion(clip, coarse, answer.touched.numpy(), cloud, evidence, checks))
         return motions
+
+    def _training_from_z_up(self) -> np.ndarray:
+        """(3, 3) rotation of z to the axis that is up for most objects of the training clips; identity if not known."""
+        ups = np.asarray(list(self.model.object_ups.values()) or [Z])
+        axes = [tuple(np.where(np.abs(up) == np.abs(up).max(), np.sign(up), 0.0)) for up in ups]
+        # Entries are 0 and 1, so rotations are exact in float32.
+        return np.rint(upright(-np.array(Counter(axes).most_common(1)[0][0]))).T.astype(np.float32)
+
+    def _requested(self, verb: str | None, clip: Clip, cloud: SampledPoints) -> RequestedVerb | Unmeasured:
+        ranges = verb_ranges(self.model.trained["diffusion"], self.hands)
+        if ranges is None:
+            return Unmeasured("the checkpoint has no ranges of its training clips")
+        if verb is None or verb not in self.vocabulary.verbs:
+            return Unmeasured("the sentence has no verb of the training clips")
+        points = ObjectPoints(cloud.points_m, cloud.normals, cloud.part)
+        return RequestedVerb(verb, ranges, ranges.numbers(clip, points))
 
     def _hand(self, text: str, options: MotionOptions) -> HandChoice:
         """The requested hand; otherwise the hand chosen from the sentence, or else by its frequency in training."""
@@ -198,7 +239,6 @@ class Generator:
             "contact_threshold_m": model.facts["contact_threshold_m"],
             "moved_as": check.actions.nearest_verb(numbers) if check else None,
             "unusual": list(check.actions.unusual(verb or "", numbers)) if check else [],
-            "faults": list(visible_faults(answer.clip, self.hands, check, verb, numbers)),
             "unseen": unseen_words(self.vocabulary, request.clip_id, verb, noun, hand.hand, self.encoder),
             "trained_on": model.facts["datasets"],
             "synthetic": bool(model.facts["synthetic"]),
@@ -214,3 +254,48 @@ def _refuse_others(checkpoint: Checkpoint, hands: HandPair, encoder: TextEncoder
         expected = f"hand {facts['hand']} {facts['hand_digest'][:12]}"
         raise BadInput(source, expected, f"{hands.name} {hands.digest[:12]}", remedy)
     refuse_other_encoder(source, facts["encoder"], encoder.identity)
+
+
+def _turned(model: ObjectModel, rotation: np.ndarray) -> ObjectModel:
+    """The object in a frame that is rotated by ``rotation`` (3, 3)."""
+    if (rotation == np.eye(3)).all():
+        return model
+    hinge = model.hinge and Hinge(rotation @ model.hinge.axis, rotation @ model.hinge.origin_m)
+    return replace(model, vertices_m=model.vertices_m @ rotation.T, hinge=hinge)
+
+
+def _turned_back(clip: Clip, model: ObjectModel, rotation: np.ndarray) -> Clip:
+    """The clip of an object that was ``_turned``, with the object in its own frame."""
+    rotvec = clip.object.rotvec
+    if (rotation != np.eye(3)).any():
+        rotvec = rotmat_to_rotvec(rotvec_to_rotmat(rotvec.astype(np.float64)) @ rotation).astype(np.float32)
+    return replace(clip, object=replace(clip.object, model=model, rotvec=rotvec))
+
+
+def closed_as_stored(clip: Clip, hands: HandPair) -> Clip:
+    """The clip with the least hinge angle at 0, as the mesh is stored; hands on the moving part move with it."""
+    track, tracks = clip.object, dict(clip.hands)
+    if track.hinge_rad is None or track.model.hinge is None:
+        return clip
+    least_rad, world_from_object = track.hinge_rad.min(), track.world_from_object
+    moved = world_from_object @ track.model.hinge.turn(np.full(clip.n_frames, -least_rad)) @ world_from_object.inverse()
+    for side, hand in clip.hands.items():
+        if hand.valid.any() and _nearest_part(clip, side, hands) == 1:
+            wrist_m = (moved @ hand.wrist_m[:, None].astype(np.float64))[:, 0].astype(np.float32)
+            rotation = moved.rotation @ rotvec_to_rotmat(hand.global_orient.astype(np.float64))
+            tracks[side] = replace(hand, wrist_m=wrist_m, global_orient=rotmat_to_rotvec(rotation).astype(np.float32))
+    return replace(clip, hands=tracks, object=replace(track, hinge_rad=track.hinge_rad - least_rad))
+
+
+def _nearest_part(clip: Clip, side: Side, hands: HandPair) -> int:
+    """The part of the object that is nearer to the joints of a hand, on average over all frames."""
+    track = clip.object
+    joints_m = track.world_from_object.inverse() @ track_joints(clip.hands[side], hands[side]).astype(np.float64)
+
+    def distance_m(part: int) -> float:
+        in_part_m = track.model.object_from_part(part, track.hinge_rad).inverse() @ joints_m
+        surface = surface_index(track.model).filled[part]
+        distances_m = surface.distance_m(np.ascontiguousarray(in_part_m.reshape(-1, 3))).reshape(joints_m.shape[:2])
+        return float(distances_m.min(axis=1).mean())
+
+    return min(track.model.parts, key=distance_m)

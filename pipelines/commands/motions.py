@@ -251,8 +251,7 @@ def animate(
         method=way,
     )
     datasets = tuple(read_params(project)["datasets"])
-    for path in animate_files(source, options, profile or current_profile(), datasets, out):
-        typer.echo(path)
+    _print_written(animate_files(source, options, profile or current_profile(), datasets, out))
 
 
 def hands(
@@ -310,7 +309,7 @@ def hands(
 
 
 def _print_written(written: "WrittenFiles") -> None:
-    for note in written.notes:
-        typer.echo(note, err=True)
+    for line in [*written.notes, *written.verdict]:
+        typer.echo(line, err=True)
     for path in written.paths:
         typer.echo(path)

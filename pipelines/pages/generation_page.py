@@ -11,6 +11,7 @@ from hoidata.contact.maps import f1_score
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.files.atomic import canonical_json
 from hoidata.hands import HandPair, track_joints
+from hoidata.metrics.verdict import summary
 from models.common.checkpoints import FILE_NAME
 from models.text2hoi.generation import GeneratedMotion
 from pipelines.pages.motion_files import ARRAYS as SHARED
@@ -70,6 +71,9 @@ def write_generation(
         "the target contact",
         title=str(motions[0].evidence["text"]),
         notes=list(notes),
+        verdicts=[
+            (f"sample {motion.evidence['number'] + 1}", summary(motion.verdict), motion.verdict) for motion in motions
+        ],
         motions=[_shown(motion, hands, f"sample {motion.evidence['number'] + 1}") for motion in motions],
         facts=[*generation_facts(motions, checkpoints), ("hand model", hands.name)],
     )

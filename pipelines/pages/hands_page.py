@@ -11,6 +11,7 @@ from hoidata.clips.clip import FPS, SIDES, Side
 from hoidata.files.atomic import canonical_json
 from hoidata.hands import HandPair
 from hoidata.metrics.unmeasured import NO_INSIDE
+from hoidata.metrics.verdict import Check, summary
 from hoidata.object_paths.path import PathStep
 from models.bimart.hands import TOUCH_M, ContactMeasures, SampledHands
 from pipelines.pages.glb import HAND_COLOURS
@@ -58,6 +59,7 @@ def write_hands(
     steps: Sequence[PathStep],
     made_from: Mapping[str, str],
     facts: Sequence[tuple[str, str]],
+    verdicts: Sequence[Sequence[Check]],
     notes: Sequence[str] = (),
 ) -> list[Path]:
     """Write motion.npz, motion.glb (further motions: motion-1.npz, ...) and index.html; returns their paths.
@@ -65,6 +67,7 @@ def write_hands(
     Args:
         steps: the steps of the object trajectory.
         made_from: digests of the networks by file.
+        verdicts: the checks of each motion.
     """
     first, files = motions[0], []
     for motion in motions:
@@ -81,6 +84,9 @@ def write_hands(
         "the least distance of the hands",
         title=f"Hands for {first.clip.object_words}",
         notes=list(notes),
+        verdicts=[
+            (f"sample {motion.number + 1}", summary(one), one) for motion, one in zip(motions, verdicts, strict=True)
+        ],
         touch_mm=round(1000 * TOUCH_M),
         fades_cm=round(100 * FADES_M),
         motions=[_shown(motion, hands, steps) for motion in motions],

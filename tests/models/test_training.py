@@ -32,10 +32,12 @@ from models.common.sampling import SamplerConfig
 from models.common.training import TrainingConfig, fit, learning_rate_factor, train_network
 from models.registry import load_network
 from models.text2hoi.diffusion import DiffusionModel, MotionGenerator
-from models.text2hoi.generation import GeneratedMotion, Generator, MotionOptions
+from models.text2hoi.generation import GeneratedMotion, Generator, MotionOptions, closed_as_stored
 from models.text2hoi.length import LengthModel
-from models.text2hoi.sampler import SamplingConfig
+from models.text2hoi.sampler import SamplingConfig, Text2Hoi
 from pipelines.generation import GenerationRequest, Models, generate_files
+from tests.builders.clips import DOWN, clip_of, flat_hand, still_object
+from tests.builders.objects import hinged_box
 from tests.models.toy import PARAMS, train
 
 
@@ -336,9 +338,8 @@ def test_visible_differences_are_reported_and_the_page_has_the_others(
         options=MotionOptions(frames=8),
         sampling={"attempts": 5},
     )
-    monkeypatch.setattr("hoidata.metrics.verb_ranges._contact_faults", lambda *_: [])
-    monkeypatch.setattr("hoidata.metrics.verb_ranges._depth_faults", lambda *_: [])
-    monkeypatch.setattr("hoidata.metrics.verb_ranges._is_still", lambda *_: False)
+    monkeypatch.setattr("hoidata.metrics.verdict.STILL_M", 0.0)
+    monkeypatch.setattr(Actions, "usual", {"lift": {"rise_m": (0.0, 1.0)}}, raising=False)
     monkeypatch.setattr(VerbRanges, "rank", lambda *_: (1, 0.0, 0.0))
     monkeypatch.setattr(Actions, "unusual", lambda self, verb, numbers: ("rise_m 9 (usual: 0 to 1)", "path_m 8"))
     notes = {}
@@ -346,13 +347,15 @@ def test_visible_differences_are_reported_and_the_page_has_the_others(
         monkeypatch.setattr(Actions, "nearest_verb", lambda self, numbers, verb=verb: verb)
         for visible in ((), ("rise_m 9 (usual: 0 to 1)",)):
             monkeypatch.setattr(Actions, "visibly_unusual", lambda self, verb, numbers, visible=visible: visible)
-            all_notes = generate_files(request, tmp_path / verb).notes
-            notes[verb, len(visible)] = [note for note in all_notes if note.startswith("sample 1")]
+            lines = generate_files(request, tmp_path / verb).verdict
+            assert lines[0].startswith("sample 1: ")
+            notes[verb, len(visible)] = lines[-1].strip()
+    passed = "ok: does the verb: 1 measures of motion are in or near their range of the training clips"
     assert notes == {
-        ("lift", 0): [],
-        ("lift", 1): ["sample 1: unlike 'lift' in training: rise_m 9 (usual: 0 to 1)"],
-        ("open", 0): [],
-        ("open", 1): ["sample 1: unlike 'lift' in training, more like 'open': rise_m 9 (usual: 0 to 1)"],
+        ("lift", 0): passed,
+        ("lift", 1): "FAILS: does the verb: unlike 'lift' in training: rise_m 9 (usual: 0 to 1)",
+        ("open", 0): passed,
+        ("open", 1): "FAILS: does the verb: unlike 'lift' in training, more like 'open': rise_m 9 (usual: 0 to 1)",
     }
     page = (tmp_path / "open" / "index.html").read_text()
     assert "the best of 5 motions" in page
@@ -368,6 +371,43 @@ def test_a_generated_clip_is_finite_and_starts_with_the_object_at_the_origin(tra
         assert np.isfinite(track_joints(track, load_embedded_hands()[side])).all()
     assert generated.contact.shape == (1024,)
     assert len(generated.clip.source_frames) == generated.evidence["frames"] >= 8
+
+
+def test_own_meshes_get_the_axis_up_that_was_up_in_training(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A z-up mesh moves as the same mesh in the frame of training, whose up axis is y."""
+    monkeypatch.setattr(Text2Hoi, "object_ups", {"a": [0.0, 1.0, 0.0], "b": [0.1, 0.99, 0.0], "c": [0.0, 0.0, 1.0]})
+    own, text, options = user_box(), "Lift a box with the left hand.", MotionOptions(frames=8)
+    y_up = replace(own, vertices_m=own.vertices_m[:, [0, 2, 1]] * [1, 1, -1])
+    given = generator(trained).generate(text, own, options)[0]
+    expected = generator(trained).generate(text, y_up, options, in_training=True)[0]
+    world_m, expected_m = (
+        one.clip.object.points_in_world(one.clip.object.model.vertices_m, own.part) for one in (given, expected)
+    )
+    np.testing.assert_allclose(world_m, expected_m, atol=1e-4)
+    np.testing.assert_allclose(given.clip.hands["left"].wrist_m, expected.clip.hands["left"].wrist_m, atol=1e-4)
+    np.testing.assert_allclose(given.points.points_m[:, [0, 2, 1]] * [1, 1, -1], expected.points.points_m, atol=1e-5)
+    assert given.clip.object.model is own
+    assert next(check for check in expected.verdict if check.name == "stands upright").passed is None
+
+
+def test_a_lid_starts_as_stored_and_its_hand_moves_with_it() -> None:
+    pair, model, frames = load_embedded_hands(), hinged_box(), 12
+    hinge_rad = np.linspace(0.5, 1.1, frames).astype(np.float32)
+    track = replace(still_object(model, frames), hinge_rad=hinge_rad)
+    lid_m = track.points_in_world(model.vertices_m, model.part)[:, model.part == 1].mean(axis=1)
+    base_m = np.tile(model.vertices_m[model.part == 0].mean(axis=0) - [0, 0, 0.03], (frames, 1))
+    clip = clip_of("generated/box", track, {"left": flat_hand(base_m), "right": flat_hand(lid_m)}, gravity=DOWN)
+    closed = closed_as_stored(clip, pair)
+    assert closed.object.hinge_rad is not None
+    np.testing.assert_allclose(closed.object.hinge_rad, hinge_rad - 0.5, atol=1e-6)
+    np.testing.assert_array_equal(closed.hands["left"].wrist_m, clip.hands["left"].wrist_m)
+    in_lid_m = [
+        model.object_from_part(1, one.object.hinge_rad).inverse()
+        @ (one.object.world_from_object.inverse() @ track_joints(one.hands["right"], pair.right).astype(np.float64))
+        for one in (clip, closed)
+    ]
+    np.testing.assert_allclose(in_lid_m[0], in_lid_m[1], atol=1e-5)
+    assert closed_as_stored(replace(clip, object=still_object(user_box(), frames)), pair).hands == clip.hands
 
 
 @pytest.mark.parametrize("name", ["steps", "batch", "validate_every", "micro_batches", "save_every"])

@@ -121,7 +121,8 @@ def typed(tiny: Path, monkeypatch: pytest.MonkeyPatch):
         if isinstance(done.exception, Exception):
             raise done.exception
         assert done.exit_code == 0, done.output
-        assert [Path(line).name for line in done.output.split()] == ["motion.npz", "motion.glb", "index.html"]
+        assert [Path(line).name for line in done.stdout.split()] == ["motion.npz", "motion.glb", "index.html"]
+        assert "does the verb: the object's motion was given, without a verb" in done.stderr
         assert (tiny / "out" / "motion.glb").read_bytes()[:4] == b"glTF"
         return dict(np.load("out/motion.npz")), Path("out/index.html").read_text()
 

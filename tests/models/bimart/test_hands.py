@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from hoidata.clips.clip import SIDES
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_vertices
+from hoidata.metrics.verdict import verdict
 from hoidata.object_paths import ObjectPath, keyframed_path, parse_keyframes
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.keypoints import hand_keypoints
@@ -120,7 +121,14 @@ def test_files_and_page_are_repeatable_and_each_array_is_documented(motions, pat
     def written(folder: str) -> list[Path]:
         digests = {"checkpoints/bimart-motion/model.safetensors": "ab" * 32}
         return write_hands(
-            tmp_path / folder, motions, PAIR, path.steps, digests, [("object's motion", "a <script>")], ["so"]
+            tmp_path / folder,
+            motions,
+            PAIR,
+            path.steps,
+            digests,
+            [("object's motion", "a <script>")],
+            [verdict(motion.clip, PAIR) for motion in motions],
+            ["so"],
         )
 
     first, again = written("a"), written("b")
@@ -134,5 +142,6 @@ def test_files_and_page_are_repeatable_and_each_array_is_documented(motions, pat
     page = first[-1].read_text(encoding="utf-8")
     assert page.count('<figure class="player') == 2 * (2 + 4)
     assert "keyframes 2 to 3" in page
+    assert page.count("does not pierce") >= 2
     assert "a &lt;script&gt;" in page
     assert "http" not in page.split("<main")[1].split("<script")[0]

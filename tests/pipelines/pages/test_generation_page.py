@@ -11,6 +11,7 @@ import pytest
 from hoidata.clips.clip import HandTrack
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import track_joints
+from hoidata.metrics.verdict import Check
 from hoidata.objects.sampling import sample_points
 from models.text2hoi.generation import GeneratedMotion
 from pipelines.pages.generation_page import ARRAYS, reached_contact, write_generation
@@ -42,7 +43,8 @@ def motion(page_clip):
         "trained_on": {"grab": 12},
     }
     coarse, contact = page_clip(frames=clip.n_frames), points.points_m[:, 0] > 0.039
-    return GeneratedMotion(clip, coarse, contact, points, evidence=evidence)
+    checks = (Check("touches", False, "3 cm <away>"), Check("carries", None, "still"))
+    return GeneratedMotion(clip, coarse, contact, points, evidence=evidence, verdict=checks)
 
 
 @pytest.fixture
@@ -104,6 +106,8 @@ def test_page_names_seed_hands_length_models_and_untrained_inputs(motion, write)
         "the object &#39;vase&#39; was never in training",
         "z is &lt;taken&gt; for up",
         "Lift a box &amp; hold it",
+        "1 of 1 checks fail: touches",
+        "3 cm &lt;away&gt;",
         "sample 1: the best of 3 motions",
         "sample 1: motion classified as &#39;pour&#39;, highest rise 15.8 cm (usual: &lt;19.1&gt; to 23.7)",
     ):
