@@ -51,6 +51,19 @@ def stored_object(name: str, clips: Path, hands: HandPair) -> ObjectModel:
     return store.object_model(name)
 
 
+def object_name(name: str, names: Sequence[str]) -> str:
+    """The only one of ``names`` that ``name`` is, or ends, apart from blanks and case: "bottle" is "waterbottle".
+
+    ``name`` itself if there is none, or several.
+    """
+    if name in names:
+        return name
+    plain = {one: "".join(filter(str.isalnum, one.lower())) for one in (*names, name)}
+    equal = [one for one in names if plain[one] == plain[name]]
+    fitting = equal or [one for one in names if plain[name] and plain[one].endswith(plain[name])]
+    return fitting[0] if len(fitting) == 1 else name
+
+
 def nearest_name(name: str, names: Sequence[str]) -> str:
     """A question that suggests the most similar of ``names``; empty if none is similar."""
     matches = get_close_matches(name, names, 1)

@@ -25,7 +25,7 @@ from models.common.checkpoints import FILE_NAME, read_info
 from models.common.repeatable import make_repeatable
 from models.text2hoi.generation import Generator, MotionOptions
 from models.text2hoi.sampler import SamplingConfig
-from pipelines.command_inputs import MeshOptions, WrittenFiles, mesh_notes, stored_object
+from pipelines.command_inputs import MeshOptions, WrittenFiles, mesh_notes, object_name, stored_object
 from pipelines.pages.generation_page import write_generation
 from pipelines.params import chosen_params, read_file
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
@@ -68,7 +68,7 @@ def generate_files(request: GenerationRequest, out: Path) -> WrittenFiles:
         BadInput: the sentence, the object or an option is not usable.
     """
     read_sentence(request.text)  # refuses other text before anything is loaded
-    notes: list[str] = []
+    request, notes = _with_object_name(request)
     user = None
     if isinstance(request.object, Path):
         user = read_user_object(request.object, request.mesh.unit, request.mesh.up, request.mesh.hinge)
@@ -187,6 +187,16 @@ def _clips_with(request: GenerationRequest, paths: StagePaths) -> Path:
     return next((run.clips for run in runs if _has_object(run, request.object)), paths.clips)
 
 
+def _with_object_name(request: GenerationRequest) -> tuple[GenerationRequest, list[str]]:
+    """The request with the full name of a dataset's object, and a note if it was typed in another way."""
+    if isinstance(request.object, Path) or request.models:
+        return request, []
+    names = [name for dataset in request.datasets for name in _object_names(StagePaths(request.profile, dataset))]
+    name = object_name(request.object, list(dict.fromkeys(names)))
+    note = [f"--object {request.object!r} is taken for {name!r}"] if name != request.object else []
+    return replace(request, object=name), note
+
+
 def _stored_object(name: str, models: Models) -> ObjectModel:
     if models.clips is not None:
         return stored_object(name, models.clips, models.hands)
@@ -237,9 +247,14 @@ def _vocabulary(checkpoints: Path) -> Vocabulary:
 
 def _has_object(paths: StagePaths, name: str | Path) -> bool:
     """Whether the dataset has an object of this name; False for the path of a mesh file."""
-    if not isinstance(name, str) or not paths.clips.is_dir() or empty_reason(paths.clips):
-        return False
-    return name in list(open_store(paths.clips, load_hands(paths.profile)).objects["object"])
+    return isinstance(name, str) and name in _object_names(paths)
+
+
+def _object_names(paths: StagePaths) -> list[str]:
+    """The objects of a dataset; none if it is not converted."""
+    if not paths.clips.is_dir() or empty_reason(paths.clips):
+        return []
+    return list(open_store(paths.clips, load_hands(paths.profile)).objects["object"])
 
 
 def _networks(request: GenerationRequest) -> list[str]:

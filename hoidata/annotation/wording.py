@@ -33,8 +33,15 @@ MIN_LETTERS = 5
 MAX_SUGGESTIONS = 3
 LETTERS = "abcdefghijklmnopqrstuvwxyz"
 _WORD = re.compile(r"[^\W\d_]+(?:['’][^\W\d_]+)*")
-# Paraphrases of training verbs, in addition to the synonyms of the word table.
-PARAPHRASES = {"pick up": "lift", "set down": "place"}
+# Paraphrases of training verbs, in addition to the synonyms of the word table; the first one that was trained is used.
+PARAPHRASES = {
+    "pick up": ("lift",),
+    "set down": ("place",),
+    "hold": ("grasp", "grab"),
+    "grab": ("grasp",),
+    "grasp": ("grab",),
+    "give": ("hand over", "pass"),
+}
 PARTICLES = frozenset({"down", "up", "out", "off", "in", "on", "over", "away", "back"})
 NO_OBJECTS = frozenset({"hand", "hands", "left hand", "right hand", "person", "man", "woman"})
 _IS = re.compile(r"\b(?:is|are|was|were|be|been|being)\s+$", re.IGNORECASE)
@@ -78,13 +85,18 @@ def understood_words(
     verb = parsed_verb(text, verbs)
     if noun in (None, "hand"):
         noun = _phrase_after_article(text, verb)
-    synonyms = (synonym_of(verb), PARAPHRASES.get(verb)) if verb else ()
-    trained_synonym = next((candidate for candidate in verbs if candidate in synonyms), None)
+    synonyms = (synonym_of(verb), *PARAPHRASES.get(verb, ())) if verb else ()
+    trained_synonym = next((synonym for synonym in synonyms if synonym in verbs), None)
     if verb not in verbs and trained_synonym:
         notes.append(f"{verb!r} is read as {trained_synonym!r}")
         text, verb = _replaced(text, str(verb), trained_synonym), trained_synonym
     if verbs and verb not in verbs and not force:
-        raise _untrained(verb or first_verb(text), text, verbs, encoder)
+        first = first_verb(text)
+        raise _untrained(verb or (None if first in vocabulary.objects else first), text, verbs, encoder)
+    longer_names = [name for name in vocabulary.objects if name and name.endswith(f" {noun}")]
+    if noun not in vocabulary.objects and len(longer_names) == 1:
+        notes += [] if force else [f"{noun!r} is taken for {longer_names[0]!r}"]
+        noun = longer_names[0]
     return Wording(text, verb, noun, tuple(notes))
 
 
@@ -102,7 +114,9 @@ def _untrained(word: str | None, text: str, verbs: Sequence[str], encoder: Calla
     first = word or _plain(_WORD.findall(text)[0])
     spelt = [verb for _, verb in _near(first, verbs, 2)]
     same_beginning = [verb for verb in verbs if verb.split()[0] == word]
-    similar = nearest_words(word, list(verbs), encoder()) if word else []
+    # Features of the encoder "hash" do not depend on the meaning of a word.
+    has_meanings = word is not None and (model := encoder()).identity["name"] != "hash"
+    similar = nearest_words(word, list(verbs), model) if word and has_meanings else []
     suggestions = list(dict.fromkeys([*same_beginning, *spelt, *similar]))[:MAX_SUGGESTIONS]
     suggestion = f"did you mean {_either(suggestions)}? Take" if suggestions else "name what the hands do with"
     return BadInput("the sentence", expected, repr(word) if word else "none", f"{suggestion} one of them, {FORCE}")

@@ -23,6 +23,7 @@ SYNONYMS = [
     ("examine", "inspect"),
     ("pick up", "lift"),
     ("set down", "place"),
+    ("give", "hand over"),
 ]
 
 
@@ -37,7 +38,7 @@ def understood(text: str, force: bool = False, *names: str) -> Wording:
         ("The mug is drunk form by teh left hand", "The mug is drunk form by the left hand", "drink", "mug"),
         ("The left hand drniks from the mug.", "The left hand drinks from the mug.", "drink", "mug"),
         ("Drinkign from a wine glass", "Drinking from a wine glass", "drink", "wine glass"),
-        ("Lift the botle with both hnads", "Lift the bottle with both hands", "lift", "bottle"),
+        ("Lift the mgu with both hnads", "Lift the mug with both hands", "lift", "mug"),
         ("Lift the mug with the rihgt hand", "Lift the mug with the right hand", "lift", "mug"),
         ("LFIT the mug", "Lift the mug", "lift", "mug"),
     ],
@@ -54,12 +55,14 @@ def test_a_typing_error_with_one_possible_word_is_corrected_and_reported(
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("Throw the ball", r"trained on \(drink, hand over, inspect.*\), got 'throw'; did you mean"),
+        ("Throw the ball", r"trained on \(drink, hand over, inspect.*\), got 'throw'; name what the hands do"),
         ("The ball is thrown by the left hand.", "got 'throw'"),
         ("The right hand juggles a mug", "got 'juggle'"),
         ("Juggling a mug with both hands", "got 'juggle'"),
         ("Pout from the mug", "got 'pout'; did you mean 'pour'"),
         ("Hand me the mug", "got 'hand'; did you mean 'hand over'"),
+        ("Mug", "got none; name what the hands do"),
+        ("Drnk from a mug", "got 'Drnk'; did you mean 'drink'"),
         ("Life the mug", "got none; did you mean 'lift'"),
         ("A mug with the right hand", "got none; name what the hands do"),
         ("Lift the bok", "got 'bok'; did you mean 'book' or 'box'"),
@@ -89,7 +92,9 @@ def test_a_synonym_becomes_the_training_verb_in_the_same_form(synonym: str, verb
         ("Take the water bottle out.", "take out", "water bottle"),
         ("Put the plate down with the left hand", "place", "plate"),
         ("Pick the ball up", "lift", "ball"),
-        ("Pour from the bottle with my left hand", "pour", "bottle"),
+        ("Pour from the bottle with my left hand", "pour", "water bottle"),
+        ("Lift the cube", "lift", "large cube"),
+        ("Lift the glass", "lift", "wine glass"),
         ("A hand lifts the red plate slowly", "lift", "red plate"),
         ("Lift the mug's lid", "lift", "mug"),
         ("Lift it.", "lift", None),
@@ -100,6 +105,21 @@ def test_a_synonym_becomes_the_training_verb_in_the_same_form(synonym: str, verb
 )
 def test_separated_verbs_and_unknown_objects_are_found(text: str, verb: str, noun: str | None) -> None:
     assert understood(text) == Wording(text, verb, noun, understood(text).notes)
+
+
+def test_the_last_word_of_one_training_object_names_it() -> None:
+    assert understood("Lift the bottle").notes == ("'bottle' is taken for 'water bottle'",)
+    assert understood("Lift the bottle").text == "Lift the bottle"
+    two = Vocabulary({("lift", noun, "left"): 1 for noun in ("water bottle", "wine bottle")})
+    ambiguous = understood_words("Lift the bottle", two, lambda: load_encoder("hash"))
+    assert (ambiguous.noun, ambiguous.notes) == ("bottle", ())
+
+
+def test_of_several_paraphrases_the_first_that_was_trained_is_used() -> None:
+    for verbs, expected in ((("grab", "grasp"), "grasp"), (("grab", "lift"), "grab")):
+        known = Vocabulary({(verb, "mug", "left"): 1 for verb in verbs})
+        wording = understood_words("Hold the mug", known, lambda: load_encoder("hash"))
+        assert (wording.verb, wording.text) == (expected, f"{expected.capitalize()} the mug")
 
 
 def test_the_name_of_the_mesh_is_a_word() -> None:

@@ -17,6 +17,7 @@ from models.text2hoi.generation import MotionOptions
 from models.text2hoi.sampler import SamplingConfig
 from pipelines import generation
 from pipelines.cli import app
+from pipelines.command_inputs import object_name
 from pipelines.generation import (
     GenerationRequest,
     Models,
@@ -271,3 +272,22 @@ def test_networks_of_different_presets_are_named(monkeypatch):
     presets = {"refiner": "paper"}
     (note,) = generation._preset_notes(Path(), names)
     assert "contact ours small, length ours small, diffusion ours small, refiner paper small" in note
+
+
+@pytest.mark.parametrize(
+    ("typed", "name"),
+    [
+        ("waterbottle", "waterbottle"),
+        ("bottle", "waterbottle"),
+        ("Water bottle", "waterbottle"),
+        ("cube", "cube"),
+        ("medium", "medium"),
+        ("cup", "cup"),
+        ("teacup", "teacup"),
+        ("", ""),
+        ("-", "-"),
+    ],
+)
+def test_an_object_is_found_by_the_end_of_its_name_if_it_is_the_only_one(typed: str, name: str) -> None:
+    names = ["bluecube", "redcube", "cubemedium", "spheremedium", "waterbottle", "cup", "eggcup"]
+    assert object_name(typed, names) == name
