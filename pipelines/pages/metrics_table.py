@@ -30,6 +30,28 @@ RETRIEVAL_BASELINES = (
     "prompt-retrieval",
     "prompt-retrieval-refined",
 )
+# What each method is, for readers of a table.
+METHODS = {
+    "text2hoi": "our networks: contact map, motion, refined hands, from sentence and object",
+    "text2hoi-coarse": "the same without the refiner",
+    "text2hoi-contact": "the same with contact refinement by optimisation",
+    "text2hoi-estimated": "the same with lengths that the network predicts",
+    "other-prompt": "the same with the sentence of another clip: control",
+    "nearest-clip": "the training clip of the same hands with the most similar sentence: retrieval",
+    "mean-motion": "the mean of all training motions",
+    "mean-pose": "the mean pose of all training clips, in every frame",
+    "ground-truth": "the recorded test clip itself",
+    "manipnet": "our network: fingers for recorded wrists and object",
+    "bimart": "our networks: both hands for the recorded object motion",
+    "bimart-unrefined": "the same without refinement",
+    "nearest-window": "the training frames with the most similar object motion: retrieval",
+    "nearest-window-refined": "the same with refinement",
+    "verb-retrieval": "a training clip of the same verb and hands, of any object: retrieval",
+    "verb-retrieval-refined": "the same with contact refinement",
+    "prompt-retrieval": "a training clip of the same verb, object and hands: retrieval",
+    "prompt-retrieval-refined": "the same with contact refinement",
+}
+ZERO = 1e-4  # smaller values are zero: no method wins by them
 CONTROLS = "controls"
 NOT_COMPUTED = "-"
 NOT_MEASURED = "not measured"
@@ -101,6 +123,11 @@ class MetricsTable:
 
     methods: list[Method]
     topics: list[Topic]
+
+    @property
+    def meanings(self) -> list[tuple[str, str]]:
+        """(method, what it is), without controls, whose names say what they change."""
+        return [(method.family, METHODS[method.family]) for method in self.methods if method.family in METHODS]
 
 
 @dataclass(frozen=True)
@@ -338,7 +365,10 @@ def _chart(metric: AnyMetric, files: _Files) -> Chart | None:
 
 
 def best_families(metric: AnyMetric, column: Mapping[str, float]) -> list[str]:
-    """Families that no other beats in a metric; the recorded clips do not compete."""
+    """Families that no other beats in a metric; the recorded clips do not compete, and zero is no merit.
+
+    A method that does not move has no jitter, and one that does not touch has no penetration.
+    """
     recorded = column.get(RECORDED)
     rivals = {family: value for family, value in column.items() if family != RECORDED}
     if metric.floor_of or (metric.direction == "closer to recorded" and recorded is None):
@@ -346,7 +376,7 @@ def best_families(metric: AnyMetric, column: Mapping[str, float]) -> list[str]:
     return [
         family
         for family, value in rivals.items()
-        if not any(is_better(metric, other, value, recorded) for other in rivals.values())
+        if abs(value) >= ZERO and not any(is_better(metric, other, value, recorded) for other in rivals.values())
     ]
 
 
@@ -394,11 +424,13 @@ def _better(metric: AnyMetric) -> str:
 
 
 def number(value: object) -> str:
-    """A value as text: whole numbers exactly, others with three significant digits or more."""
+    """A value as text: whole numbers exactly, others with three significant digits or more, 0 below ``ZERO``."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return "" if value is None else str(value)
     if isinstance(value, int):
         return f"{int(value):,}"
+    if abs(value) < ZERO:
+        value = 0.0
     return f"{value:,.1f}" if abs(value) >= 100 else f"{value:#.3g}"
 
 

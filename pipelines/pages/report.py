@@ -19,6 +19,7 @@ from pipelines.pages.examples import first_motion, motion_contact, shown_ids, sh
 from pipelines.pages.metrics_table import CONTROLS, RETRIEVAL_BASELINES, MetricsTable, metrics_tables
 from pipelines.pages.player import Player, contact_player, motion_player, render_page
 from pipelines.pages.quality import QualityFacts, read_quality
+from pipelines.pages.summary import MAX_EXAMINED, Summary, dataset_summary
 from pipelines.pages.surface import ContactPaint
 
 CONTACT_EXAMPLES = 3
@@ -53,6 +54,8 @@ class Section:
     table: MetricsTable | None = None
     curves: list[dict[str, str]] = field(default_factory=list)
     missing: list[tuple[str, str]] = field(default_factory=list)  # (network, why it was not trained)
+    summary: Summary | None = None
+    examples: list[Player] = field(default_factory=list)  # the best and the worst of the summary
 
 
 # Text encoders other than CLIP, which Text2HOI uses.
@@ -81,11 +84,11 @@ def write_report(
     all_sections = [_section(name, folders, names, hands) for name, names in families.items()]
     sections = [section for section in all_sections if not section.facts.empty or section.facts.quarantine]
     synthetic = any(section.facts.synthetic for section in sections)
-    has_players = any(section.motions or section.contact for section in sections)
+    has_players = any(section.motions or section.contact or section.examples for section in sections)
     page = render_page(
         "report.html", title=f"hoidata report: {profile}", profile=profile, sections=sections,
         empty_sections=[section for section in all_sections if section.facts.empty], synthetic=synthetic,
-        hand_model=hands.name, has_players=has_players, stand_ins=_stand_ins(sections),
+        hand_model=hands.name, has_players=has_players, max_examined=MAX_EXAMINED, stand_ins=_stand_ins(sections),
     )  # fmt: skip
     for section in sections:
         if section.page:
@@ -114,6 +117,9 @@ def _section(name: str, folders: ReportFolders, families: Sequence[str], hands: 
     networks = sorted(path for path in (folders.checkpoints / name).glob("*") if path.is_dir())
     samples = folders.samples / name / families[0]
     motions, motion_facts = _motions(facts, hands, _sample_folders(folders.samples / name, families[0]))
+    table = metrics_tables(folders.metrics / name, families)
+    trained = [folder.name for folder in networks if not reason_for_nothing(folder)]
+    summary = dataset_summary(facts.annotated, trained, families[0], samples, table, hands)
     return Section(
         facts,
         title,
@@ -123,10 +129,23 @@ def _section(name: str, folders: ReportFolders, families: Sequence[str], hands: 
         motions=motions,
         motion_facts=motion_facts,
         contact=_contact_pairs(facts, hands, samples),
-        table=metrics_tables(folders.metrics / name, families),
+        table=table,
         curves=[chart for folder in networks if (chart := _loss_chart(name, folder.name, folder / "log.csv"))],
         missing=[(folder.name, reason) for folder in networks if (reason := reason_for_nothing(folder))],
+        summary=summary,
+        examples=_example_players(facts.annotated, summary, hands),
     )
+
+
+def _example_players(annotated: AnnotatedStore | None, summary: Summary, hands: HandPair) -> list[Player]:
+    examples = [(kind, one) for kind, one in (("Best", summary.best), ("Worst", summary.worst)) if one is not None]
+    if annotated is None:
+        return []
+    return [
+        _player(annotated, one.clip_id, one.motion, hands, f"{kind}, {one.words}",
+                motion_contact(annotated, one.clip_id, one.motion, hands))
+        for kind, one in examples
+    ]  # fmt: skip
 
 
 def _shown_words(facts: DatasetFacts) -> str:

@@ -1,15 +1,19 @@
 """The table of metrics: all methods compared, the best one, and comparisons with retrieval baselines."""
 
 import json
+from pathlib import Path
 
 import jinja2
 import pytest
 
 from hoidata.errors import BadInput
 from hoidata.metrics.registry import metric
+from models.registry import family_names
 from pipelines.pages.metrics_table import (
+    METHODS,
     NOT_COMPUTED,
     OTHER_EVALUATOR,
+    RETRIEVAL_BASELINES,
     best_families,
     is_worse_than,
     markdown_table,
@@ -18,6 +22,8 @@ from pipelines.pages.metrics_table import (
     printed_table,
     unmeasured_lines,
 )
+from pipelines.params import read_params
+from pipelines.stages.families import families_of
 
 ACCURACY = "accuracy_top1_corrected"
 FIGURES = {
@@ -117,6 +123,24 @@ def test_closer_to_recorded_needs_the_recorded_value():
     assert best_families(metric("jitter_m_s3"), column) == []
     assert not is_worse_than("nearest-clip", metric("jitter_m_s3"), "ours", column)
     assert best_families(metric("jitter_m_s3"), column | {"ground-truth": 8.0}) == ["ours"]
+
+
+def test_a_value_that_is_numerically_zero_is_not_the_best(folder):
+    for zero in (6e-6, 0.0, -6e-6):
+        assert best_families(metric("joint_error_mm"), {"mean-pose": zero, "ours": 0.3}) == []
+        assert number(zero) == "0.00"
+    assert best_families(metric("joint_error_mm"), {"mean-pose": 2e-4, "ours": 0.3}) == ["mean-pose"]
+    (folder / "nearest-clip.json").write_text(written({"joint_error_mm": 6e-6}))
+    cell = cells_of(table_of(folder), "nearest-clip")[title("joint_error_mm")]
+    assert (cell.text, cell.mark) == ("0.00", "")
+
+
+def test_the_rows_are_explained(folder):
+    assert dict(table_of(folder).meanings)["ground-truth"] == "the recorded test clip itself"
+    assert "the recorded test clip itself" in page_of(folder)
+    assert set(METHODS) <= set(family_names())
+    shown = {*families_of(read_params(Path(__file__).parents[3]), "grab"), *RETRIEVAL_BASELINES}
+    assert shown <= set(METHODS)
 
 
 def test_values_of_different_evaluators_are_not_compared(folder):
