@@ -89,7 +89,10 @@ def _shown(motion: GeneratedMotion, hands: HandPair, caption: str) -> dict[str, 
         "caption": caption,
         "player": motion_player(clip, hands, title, caption, paints["generated"], "generated contact"),
         "before": motion_player(coarse, hands, f"{title}, before refinement", caption),
-        "maps": [contact_player(clip, paint, f"{title}, {name}", name, name) for name, paint in paints.items()],
+        "maps": [
+            contact_player(clip, paint, f"{title}, {name}", name, name, paints["target"])
+            for name, paint in paints.items()
+        ],
         "agreement": _agreement(motion.contact, reached),
     }
 

@@ -25,6 +25,7 @@ from pipelines.pages.glb import (
     HAND_COLOURS,
     MOVING_PART_COLOUR,
     OBJECT_COLOUR,
+    OTHER_OBJECT_COLOUR,
     glb_bytes,
     upright_rotation,
 )
@@ -149,6 +150,8 @@ def _legend(clip: Clip) -> tuple[tuple[str, str], ...]:
     rows.append((clip.object_words, css_colour(OBJECT_COLOUR)))
     if clip.object.is_articulated:
         rows.append(("moving part", css_colour(MOVING_PART_COLOUR)))
+    if others := dict.fromkeys(track.model.name.replace("_", " ") for track in clip.other_objects):
+        rows.append((", ".join(others), css_colour(OTHER_OBJECT_COLOUR)))
     return tuple(rows)
 
 

@@ -1,6 +1,7 @@
 """The files of a generated motion: arrays, an animated model, and a self-contained page."""
 
 import contextlib
+import json
 import re
 import subprocess
 from dataclasses import replace
@@ -122,6 +123,14 @@ def test_generated_contact_is_that_of_joints_near_points(motion, hands, write):
     )
     assert set(np.flatnonzero(reached)) == set(entries["point"].tolist())
     assert f"{reached.sum()} touched points" in write(motion)[-1].read_text()
+
+
+def test_target_and_generated_contact_are_seen_from_one_side(motion, write):
+    far = replace(motion, contact=motion.points.points_m[:, 0] < -0.039)  # the touched side is the opposite one
+    page = write(far)[-1].read_text()
+    views = [json.loads(text.split("</script>")[0]) for text in page.split('class="view">')[1:]]
+    target, generated = (view["azimuth_rad"] for view in views if view["frames"] == 1)
+    assert target == generated
 
 
 def test_every_array_is_explained_on_the_page(motion, write):

@@ -162,6 +162,16 @@ def test_idle_hand_far_away_does_not_widen_the_view(hands, page_clip):
     assert view_of(idle, hands).radius_m == view_of(page_clip(), hands).radius_m
 
 
+def test_other_objects_are_in_the_legend_once(hands, page_clip):
+    clip = page_clip()
+    model = replace(clip.object.model, name="low_table")
+    table = replace(clip.object, model=model)
+    legend = dict(motion_player(replace(clip, other_objects=(table, table)), hands, "title").legend)
+    assert list(legend)[-1] == "low table"
+    assert len(set(legend.values())) == len(legend)
+    assert "low table" not in dict(motion_player(clip, hands, "title").legend)
+
+
 def test_the_ground_lies_under_a_table_which_does_not_widen_the_view(hands, page_clip):
     clip = page_clip()
     slab = np.array([[-0.5, -0.4, 0.0], [0.5, -0.4, 0.0], [0.5, 0.4, 0.0], [-0.5, 0.4, -0.3]])
