@@ -31,6 +31,7 @@ RENAMED_KEYS: dict[str, tuple[str, ...]] = {
     "rows": ("steps_per_clip",),
     "rule": ("guidance_rule",),
     "max_attempts": ("attempts",),
+    "refined": ("refinement",),
     "refined_by": ("refine",),
     "text_input": ("verb_input",),
     "told": ("condition_on_hands",),

@@ -1,4 +1,4 @@
-"""Fit hands of known shape to vertex keypoints: a rigid fit in closed form, then Levenberg-Marquardt."""
+"""Fit hands to vertex keypoints: a rigid fit in closed form, then Levenberg-Marquardt (BimArt, Eq. 8)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,13 +8,16 @@ import numpy as np
 from hoidata.clips.clip import SIDES, HandTrack
 from hoidata.errors import BadInput
 from hoidata.hands.fitting import FitSettings, pose_precision
-from hoidata.hands.model import TIP_VERTICES, HandModel, HandPair, Side
+from hoidata.hands.model import N_SHAPE, TIP_VERTICES, HandModel, HandPair, Side
 from hoidata.refinement.skin import HandPose, SkinnedHand
 
 STEPS = 20
+SHAPE_STEPS, SHAPE_FRAMES = 12, 48  # most steps of the shape fit; most frames, evenly spaced, that determine a shape
+SHAPE_PRECISION = 0.3  # of the shape's zero-mean normal prior, per frame: errors of keypoints are alike in all frames
 NOISE_M = 0.003  # standard deviation of a keypoint
 PALM_WEIGHT = 0.5  # a vertex whose skin weight of the wrist is larger belongs to the palm
 MIN_DAMPING, MAX_DAMPING = 1e-8, 1e8
+MIN_GAIN = 1e-4  # the shape fit stops when a step reduces the cost by less than this fraction
 
 
 @dataclass(frozen=True)
@@ -33,19 +36,19 @@ class GeneratedKeypoints:
 
 def fit_hands(
     pair: HandPair,
-    betas: np.ndarray,
+    betas: np.ndarray | None,
     keypoint_ids: np.ndarray,
     generated: Mapping[Side, GeneratedKeypoints],
     template_m: np.ndarray | None = None,
 ) -> dict[Side, HandTrack]:
-    """Fit hand poses to generated keypoints, each frame by itself.
+    """Fit hand poses to generated keypoints, each frame by itself, after one shape per hand over all frames.
 
     Args:
         pair: hand models of both sides.
-        betas: (2, 10) shapes of the left and the right hand.
+        betas: (2, 10) shapes of the left and the right hand if they are known; None: fitted.
         keypoint_ids: (keypoint,) vertices, the same on both sides.
         generated: keypoints of each hand.
-        template_m: (2, 778, 3) personal rest meshes instead of the models' templates.
+        template_m: (2, 778, 3) personal rest meshes instead of the models' templates; not used if shapes are fitted.
 
     Returns:
         One track per side, valid in the frames that have the hand.
@@ -57,23 +60,33 @@ def fit_hands(
     for side, hand in generated.items():
         check_generated(side, hand, keypoint_ids)
         index = SIDES.index(side)
-        template = None if template_m is None else template_m[index]
+        template = None if template_m is None or betas is None else template_m[index]
         present = np.flatnonzero(hand.is_present)
-        pose = _fitted(pair[side], betas[index], template, keypoint_ids, hand.keypoints_m[present])
+        keypoints_m = hand.keypoints_m[present]
+        shape = fitted_shape(pair[side], keypoint_ids, keypoints_m) if betas is None else betas[index]
+        pose = _fitted(pair[side], shape, template, keypoint_ids, keypoints_m)
         # A frame without the hand gets the pose of the nearest frame, so that all numbers are finite.
         nearest = np.abs(np.arange(len(hand.is_present))[:, None] - present).argmin(axis=1)
-        tracks[side] = pose.taken(nearest).track(betas[index], hand.is_present, template)
+        tracks[side] = pose.taken(nearest).track(shape, hand.is_present, template)
     return tracks
 
 
-def check_generated(side: Side, hand: GeneratedKeypoints, keypoint_ids: np.ndarray) -> None:
-    """Raise BadInput if the arrays of a hand have inconsistent shapes, or if no frame has the hand."""
+def check_generated(
+    side: Side, hand: GeneratedKeypoints, keypoint_ids: np.ndarray, lengths: tuple[int, ...] = ()
+) -> None:
+    """Raise BadInput if the arrays of a hand have inconsistent shapes, or if no frame has the hand.
+
+    lengths: frames of further tracks, which must be as many.
+    """
     n_frames, expected_shape = len(hand.keypoints_m), (len(keypoint_ids), 3)
     shapes = (hand.keypoints_m.shape[1:], hand.to_object_m.shape[1:], len(hand.to_object_m), len(hand.is_active))
     if shapes != (expected_shape, expected_shape, n_frames, n_frames) or len(keypoint_ids) < 3:
         got = f"{hand.keypoints_m.shape}, {hand.to_object_m.shape}, {hand.is_active.shape}"
         expected = f"(frame, {len(keypoint_ids)}, 3) twice and (frame,), of three keypoints or more"
         raise BadInput(f"generated {side} hand", expected, got, "check the caller")
+    if any(length != n_frames for length in lengths):
+        got = f"{', '.join(map(str, (n_frames, *lengths)))} frames"
+        raise BadInput(f"refinement of the {side} hand", "equally many frames", got, "check the caller")
     if not hand.is_present.any():
         raise BadInput(f"generated {side} hand", "a frame with finite keypoints", "none", "omit this hand")
 
@@ -88,6 +101,40 @@ def pose_prior(model: HandModel) -> tuple[np.ndarray, np.ndarray]:
     return model.mean_pose, precision
 
 
+def fitted_shape(model: HandModel, ids: np.ndarray, keypoints_m: np.ndarray) -> np.ndarray:
+    """Fit one shape (10,) to keypoints (frame, keypoint, 3) of vertices ``ids``, together with the poses.
+
+    Levenberg-Marquardt; the poses are eliminated from the normal equations (Schur complement).
+    """
+    chosen = np.unique(np.linspace(0, len(keypoints_m) - 1, min(SHAPE_FRAMES, len(keypoints_m))).round().astype(int))
+    keypoints_m, prior = keypoints_m[chosen], pose_prior(model)
+    precision, betas, damping = SHAPE_PRECISION * len(chosen), np.zeros(N_SHAPE), 1e-3
+    skin = SkinnedHand(model, betas, None, ids)
+    # Vertices are linear in the shape: the derivatives are differences to the mean shape.
+    mean_hand, unit_hands = skin, [SkinnedHand(model, unit, None, ids) for unit in np.eye(N_SHAPE)]
+    pose = _start(skin, model.mean_pose, keypoints_m)
+    cost = _cost(skin, pose, keypoints_m, prior).sum()
+    for _ in range(SHAPE_STEPS):
+        derivative, residual, matrix, vector = _equations(skin, pose, keypoints_m, prior, damping)
+        mean_m = mean_hand.vertices_m(mean_hand.chain(pose))
+        by_shape = np.stack([hand.vertices_m(hand.chain(pose)) - mean_m for hand in unit_hands], -1)
+        by_shape = by_shape.reshape(len(pose.wrist_m), -1, N_SHAPE)
+        mixed = derivative.swapaxes(1, 2) @ by_shape / NOISE_M**2
+        solved = np.linalg.solve(matrix, np.concatenate((mixed, vector[..., None]), axis=2))
+        complement = (by_shape.swapaxes(1, 2) @ by_shape / NOISE_M**2 - mixed.swapaxes(1, 2) @ solved[..., :-1]).sum(0)
+        right = (by_shape.swapaxes(1, 2) @ residual / NOISE_M**2 - mixed.swapaxes(1, 2) @ solved[..., -1:]).sum(0)[:, 0]
+        change = np.linalg.solve(complement + precision * np.eye(N_SHAPE), right - precision * betas)
+        trial_betas, trial = betas + change, pose.moved(solved[..., -1] - solved[..., :-1] @ change)
+        trial_skin = SkinnedHand(model, trial_betas, None, ids)
+        trial_cost = _cost(trial_skin, trial, keypoints_m, prior).sum() + precision * trial_betas @ trial_betas
+        damping = damping / 8 if trial_cost < cost else damping * 8
+        if trial_cost < cost:
+            skin, pose, betas, gain, cost = trial_skin, trial, trial_betas, 1 - trial_cost / cost, trial_cost
+            if gain < MIN_GAIN:
+                break
+    return betas
+
+
 def _fitted(
     model: HandModel, betas: np.ndarray, template_m: np.ndarray | None, ids: np.ndarray, keypoints_m: np.ndarray
 ) -> HandPose:
@@ -97,7 +144,8 @@ def _fitted(
     damping = np.full(len(keypoints_m), 1e-3)
     cost = _cost(skin, pose, keypoints_m, prior)
     for _ in range(STEPS):
-        trial = pose.moved(_step(skin, pose, keypoints_m, prior, damping))
+        _, _, matrix, vector = _equations(skin, pose, keypoints_m, prior, damping)
+        trial = pose.moved(np.linalg.solve(matrix, vector[..., None])[..., 0])
         trial_cost = _cost(skin, trial, keypoints_m, prior)
         is_better = trial_cost < cost
         pose, cost = trial.where(is_better, pose), np.where(is_better, trial_cost, cost)
@@ -131,14 +179,19 @@ def _cost(
     return (residual**2).sum(axis=(1, 2)) / NOISE_M**2 + ((deviation @ prior[1]) * deviation).sum(axis=1)
 
 
-def _step(
+def _equations(
     skin: SkinnedHand,
     pose: HandPose,
     keypoints_m: np.ndarray,
     prior: tuple[np.ndarray, np.ndarray],
-    damping: np.ndarray,
-) -> np.ndarray:
-    """(frame, 51) damped Gauss-Newton step of each frame."""
+    damping: np.ndarray | float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Damped Gauss-Newton equations of each frame's pose.
+
+    Returns:
+        Derivatives (frame, 3 x keypoint, 51) and residuals (frame, 3 x keypoint, 1) of the keypoints; matrix
+        (frame, 51, 51) and minus half the gradient (frame, 51).
+    """
     chain = skin.chain(pose, slopes=True)
     derivative = skin.all_derivatives(chain)
     residual = (keypoints_m - skin.vertices_m(chain)).reshape(len(keypoints_m), -1, 1)
@@ -147,5 +200,5 @@ def _step(
     matrix[:, 6:, 6:] += prior[1]
     vector[:, 6:] += (prior[0] - pose.fingers.reshape(-1, 45)) @ prior[1]
     diagonal = np.einsum("fii->fi", matrix)
-    diagonal += damping[:, None] * diagonal
-    return np.linalg.solve(matrix, vector[..., None])[..., 0]
+    diagonal += np.reshape(damping, (-1, 1)) * diagonal
+    return derivative, residual, matrix, vector

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hoidata.clips.clip import HandTrack, ObjectTrack
-from hoidata.errors import BadInput
 from hoidata.hands.model import HandModel, HandPair, Side
 from hoidata.refinement.banded import acceleration_equations, minimize_banded, second_differences
 from hoidata.refinement.fitting import GeneratedKeypoints, check_generated, pose_prior
@@ -63,10 +62,7 @@ def refine_hands(
     field = ObjectField(object_track)
     refined = {}
     for side, hand in generated.items():
-        check_generated(side, hand, keypoint_ids)
-        if not len(hand.keypoints_m) == object_track.n_frames == tracks[side].n_frames:
-            got = f"{len(hand.keypoints_m)}, {tracks[side].n_frames} and {object_track.n_frames} frames"
-            raise BadInput(f"refinement of the {side} hand", "equally many frames", got, "check the caller")
+        check_generated(side, hand, keypoint_ids, (tracks[side].n_frames, object_track.n_frames))
         refiner = _HandRefiner(pair[side], keypoint_ids, hand, tracks[side], field=field, settings=settings)
         refined[side] = refiner.refined()
     return refined

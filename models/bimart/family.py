@@ -17,7 +17,7 @@ from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import HandPair
 from hoidata.hands.model import N_VERTICES
 from hoidata.metrics.target_contact import TargetDistances
-from hoidata.refinement import GeneratedKeypoints, RefinementSettings, fit_hands, refine_hands
+from hoidata.refinement import GeneratedKeypoints, fit_hands, refine_as_released, refine_hands
 from hoidata.sensors.part_bps import distance_map
 from hoidata.settings import build_config
 from hoidata.store.annotated import AnnotatedStore
@@ -33,16 +33,18 @@ NO_OTHER = {"other path": "no training clip of its object", "other object": "all
 DIAGNOSED_SAMPLES, DIAGNOSED_CLIPS = 10, 32
 MAX_BATCH_SIZE = 16  # motions of one length that share a batch
 Change = Literal["none", "other path", "other object", "zero map"]
+Preset = Literal["ours", "paper"]
+Refinement = Literal["ours", "paper", "none"]  # "paper": Eqs. 9 to 12 (``hoidata.refinement.released``)
 
 
 @dataclass(frozen=True)
 class FamilyConfig:
     """The section ``sample.bimart`` of params.yaml."""
 
-    preset: Literal["ours", "paper"] | None = None  # of the sampling; None: the preset of the trained networks
+    preset: Preset | None = None  # of sampling and refinement; None: the preset of the trained networks
     sampling: Mapping[str, Any] = field(default_factory=dict)  # changes to the preset, see ``SamplingConfig``
-    refined: bool = True  # refine the fitted hands against the object
-    refinement: RefinementSettings = field(default_factory=RefinementSettings)
+    refinement: Refinement | None = None  # of the fitted hands against the object; None: that of the preset
+    shape: Literal["fitted", "given"] = "fitted"  # to the generated keypoints (Eq. 8), or that of the request
 
 
 @dataclass(frozen=True)
@@ -51,25 +53,27 @@ class BimArtSampler:
 
     model: BimArt
     pair: HandPair
-    config: FamilyConfig
     synthetic: bool  # whether the networks were trained on generated clips
+    refinement: Refinement = "ours"
+    fits_shape: bool = True
     change: Change = "none"  # the condition that a negative control replaces
     annotated: AnnotatedStore | None = None  # the dataset, for negative controls
 
     @classmethod
-    def load(cls, sources: Sources, refined: bool = True, change: Change = "none") -> "BimArtSampler":
+    def load(cls, sources: Sources, refinement: Refinement | None = None, change: Change = "none") -> "BimArtSampler":
         """Load both checkpoints and the settings ``sample.bimart``."""
         config = build_config(FamilyConfig, sources.settings.get("bimart"), "params.yaml: sample.bimart")
         motion = load_checkpoint(sources.checkpoints / MOTION.name, MOTION, sources.device)
         assert isinstance(motion.network, MotionModel)
-        preset = config.preset or preset_of(motion.network.config)
+        preset: Preset = config.preset or preset_of(motion.network.config)
         sampling = sampling_of(preset, config.sampling, "params.yaml: sample.bimart.sampling")
         contact = load_checkpoint(sources.checkpoints / CONTACT.name, CONTACT, sources.device)
         return cls(
             model=BimArt.of(contact, motion, sampling, sources.device),
             pair=sources.hands,
-            config=replace(config, refined=config.refined and refined),
             synthetic=bool(motion.facts["synthetic"]),
+            refinement=refinement or config.refinement or preset,
+            fits_shape=config.shape == "fitted",
             change=change,
             annotated=sources.annotated,
         )
@@ -175,9 +179,10 @@ class BimArtSampler:
         """Fit hands to the sampled keypoints, and refine them against the object."""
         hands, clip = self.keypoints_in_world(request, motion), clip_without_hands(request, self.synthetic)
         ids = self.model.motion.keypoint_ids.cpu().numpy()
-        tracks = fit_hands(self.pair, request.betas, ids, hands, request.template_m)
-        if self.config.refined:
-            tracks = refine_hands(self.pair, ids, hands, tracks, clip.object, self.config.refinement)
+        tracks = fit_hands(self.pair, None if self.fits_shape else request.betas, ids, hands, request.template_m)
+        if self.refinement != "none":
+            refine = refine_hands if self.refinement == "ours" else refine_as_released
+            tracks = refine(self.pair, ids, hands, tracks, clip.object)
         return replace(clip, hands={**clip.hands, **tracks})
 
     def _requested_scene(self, request: Request) -> Scene:
@@ -275,11 +280,11 @@ def _errors_mm(
     return float(np.mean(map_errors)), min(map_errors), mean_error, keypoints, difference
 
 
-def _family(name: str, title: str, refined: bool = True, change: Change = "none") -> Family:
+def _family(name: str, title: str, refinement: Refinement | None = None, change: Change = "none") -> Family:
     return Family(
         name,
         title,
-        lambda sources: BimArtSampler.load(sources, refined, change),
+        lambda sources: BimArtSampler.load(sources, refinement, change),
         networks=(CONTACT, MOTION) if name == "bimart" else (),
         uses=(CONTACT.name, MOTION.name),
         diagnose=diagnose if name == "bimart" else lambda sources: {},
@@ -287,7 +292,7 @@ def _family(name: str, title: str, refined: bool = True, change: Change = "none"
 
 
 BIMART = _family("bimart", "BimArt: hands for the object's motion")
-UNREFINED = _family("bimart-unrefined", "BimArt before refinement", refined=False)
+UNREFINED = _family("bimart-unrefined", "BimArt before refinement", refinement="none")
 OTHER_PATH = _family("bimart-other-path", "BimArt conditioned on another motion of the object", change="other path")
 OTHER_OBJECT = _family("bimart-other-object", "BimArt conditioned on another object", change="other object")
 ZERO_MAP = _family("bimart-zero-map", "BimArt conditioned on a contact map of zeros", change="zero map")

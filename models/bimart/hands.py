@@ -129,7 +129,7 @@ def _sample_motion(
     sampler: BimArtSampler, object_track: ObjectTrack, request: Request, points: SampledPoints
 ) -> SampledHands:
     motion = sampler.sample_motions([request])[0]
-    unrefined_sampler = replace(sampler, config=replace(sampler.config, refined=False))
+    unrefined_sampler = replace(sampler, refinement="none")
     # Features are float32: the clips get the given track instead of the one read from features.
     refined_clip, unrefined_clip = (
         replace(one_sampler.clip(request, motion), object=object_track) for one_sampler in (sampler, unrefined_sampler)

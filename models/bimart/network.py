@@ -19,14 +19,14 @@ from torch.nn import functional
 
 from hoidata.devices import send
 from models.bimart.scene import FeatureConfig, Scene
-from models.common.sampling import TRAIN_STEPS, alphas_cumprod
+from models.common.sampling import TRAIN_STEPS, Schedule, alphas_cumprod
 from models.common.spline import projected
 from models.common.transformer import Encoder, TransformerConfig, attention_mask_of, sinusoid, to_frames, to_tokens
 
 
 @dataclass(frozen=True)
 class DenoiserConfig:
-    """Architecture of one denoiser; the defaults are the paper's."""
+    """Architecture of one denoiser; the defaults are the paper's, but for the noise schedule of its released code."""
 
     features: FeatureConfig = field(default_factory=FeatureConfig)
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
@@ -36,6 +36,7 @@ class DenoiserConfig:
     latents: Literal["concatenate", "joint"] = "concatenate"
     condition_on_hands: bool = False  # on which hands are active; inactive hands are masked in input and output
     diffusion_steps: int = 50  # trained steps of the 1,000: 50 are sampled one by one, 1,000 by any sampler
+    noise_schedule: Schedule = "cosine"
     position_dropout: float = 0.1  # of tokens with their positional encoding
     min_std_fraction: float = 0.0  # normalisation: least standard deviation, relative to that of its group
     knot_frames: int = 0  # the output is a spline with a control point every so many frames; 0: any values
@@ -124,7 +125,7 @@ class Denoiser(nn.Module):
         for name, count in (("input", features.scene_size), ("", size), ("contact", features.contact_size)):
             self.register_buffer(f"{name}_mean".strip("_"), torch.zeros(count))
             self.register_buffer(f"{name}_scale".strip("_"), torch.ones(count))
-        self.register_buffer("signal", alphas_cumprod(), persistent=False)
+        self.register_buffer("signal", alphas_cumprod(schedule=config.noise_schedule), persistent=False)
         self.register_buffer("basis_points", torch.from_numpy(features.basis.points()))
         self.register_buffer("keypoint_ids", torch.zeros(features.keypoints, dtype=torch.long))
 

@@ -174,7 +174,7 @@ class RefinedWindow(SingleRequestSampler):
             return Skipped(request.motion_id, NO_WINDOW)
         hands, ids = self._hands(request), hand_keypoints(self.pair.right, FEATURES.keypoints)
         clip = clip_without_hands(request, self.nearest.synthetic)
-        tracks = fit_hands(self.pair, request.betas, ids, hands, request.template_m)
+        tracks = fit_hands(self.pair, None, ids, hands)
         tracks = refine_hands(self.pair, ids, hands, tracks, clip.object)
         return replace(clip, hands={**clip.hands, **tracks})
 

@@ -171,7 +171,7 @@ def sampling_of(preset: str, changes: Mapping[str, Any], source: str) -> Samplin
     return replace(PRESETS[preset], sampler=sampler, **others)
 
 
-def preset_of(config: DenoiserConfig) -> str:
+def preset_of(config: DenoiserConfig) -> Literal["ours", "paper"]:
     """The preset that a network was trained with."""
     return "ours" if config.condition_on_hands else "paper"
 
@@ -265,7 +265,7 @@ class BimArt:
         else:
             target = None if self.config.contact_guidance == "off" else self._contact_target(tasks, contact_m)
             denoise = self._guided_denoiser(network, encoded, layout, target)
-        return sample(denoise, noise, self.config.sampler, generators)
+        return sample(denoise, noise, self.config.sampler, generators, network.config.noise_schedule)
 
     def _windows(
         self, network: Denoiser, tasks: Sequence[SamplingTask], layout: Layout, contact_m: Tensor | None

@@ -1,8 +1,8 @@
 """Noise schedule and samplers for any denoiser that predicts the clean motion (x0-prediction).
 
-Text2HOI has 1,000 steps and a cosine schedule (Nichol and Dhariwal 2021). Samplers: DDPM takes every step (Ho et al.
-2020), DDIM skips steps (Song et al. 2021), and second-order multistep DPM-Solver++ (Lu et al. 2022) needs even fewer.
-The schedule is plain numbers, so that no step waits for a GPU.
+Text2HOI has 1,000 steps and a cosine schedule (Nichol and Dhariwal 2021), BimArt's paper a linear schedule. Samplers:
+DDPM takes every step (Ho et al. 2020), DDIM skips steps (Song et al. 2021), and second-order multistep DPM-Solver++ (Lu
+et al. 2022) needs even fewer. The schedule is plain numbers, so that no step waits for a GPU.
 
 A denoiser of motions is ``x0 = denoise(x_t, t)`` on a pair (hands, object).
 """
@@ -23,6 +23,8 @@ from hoidata.errors import BadInput
 TRAIN_STEPS = 1000
 Motion = tuple[Tensor, Tensor]
 Kind = Literal["ddim", "ddpm", "dpm++"]
+Schedule = Literal["cosine", "linear"]
+FIRST_BETA, LAST_BETA = 1e-4, 0.02  # of the linear schedule (Ho et al. 2020, Sec. 4)
 Denoise = Callable[[Tensor, Tensor, Tensor], Motion]
 
 
@@ -39,8 +41,11 @@ class SamplerConfig:
 
 
 @cache
-def alpha_bar_values() -> tuple[float, ...]:
+def alpha_bar_values(schedule: Schedule = "cosine") -> tuple[float, ...]:
     """Alpha-bar (Ho et al. 2020), the fraction of signal variance, at each of the 1,000 steps; betas at most 0.999."""
+    if schedule == "linear":
+        betas = torch.linspace(FIRST_BETA, LAST_BETA, TRAIN_STEPS, dtype=torch.float64)
+        return tuple((1 - betas).cumprod(0).tolist())
     curve = [math.cos((step / TRAIN_STEPS + 0.008) / 1.008 * math.pi / 2) ** 2 for step in range(TRAIN_STEPS + 1)]
     alpha_bars, alpha_bar = [], 1.0
     for step in range(TRAIN_STEPS):
@@ -50,9 +55,9 @@ def alpha_bar_values() -> tuple[float, ...]:
     return tuple(alpha_bars)
 
 
-def alphas_cumprod(device: torch.device | str = "cpu") -> Tensor:
+def alphas_cumprod(device: torch.device | str = "cpu", schedule: Schedule = "cosine") -> Tensor:
     """(1000,) float32 of :func:`alpha_bar_values`."""
-    return torch.tensor(alpha_bar_values()).to(device)
+    return torch.tensor(alpha_bar_values(schedule)).to(device)
 
 
 def timesteps(steps: int) -> list[int]:
@@ -111,12 +116,13 @@ def sample(
     noise: Tensor,
     config: SamplerConfig,
     generator: torch.Generator | list[torch.Generator],
+    schedule: Schedule = "cosine",
 ) -> Tensor:
     """Samples from noise (B, ...), on its device; ``denoise(x, t)`` predicts the clean x at timesteps t (B,).
 
     generator: of the noise that DDPM adds, one for the batch or one per sample.
     """
-    x, steps, alpha_bars = noise, timesteps(config.steps), alpha_bar_values()
+    x, steps, alpha_bars = noise, timesteps(config.steps), alpha_bar_values(schedule)
     previous_clean: Tensor | None = None
     for number, step in enumerate(steps):
         alpha_bar = alpha_bars[step]

@@ -81,6 +81,27 @@ def test_a_motion_is_recovered_from_its_keypoints():
         assert np.abs(fitted[side].wrist_m - truth[side].wrist_m).max() < 0.001
 
 
+@pytest.mark.parametrize("spread", [0.0, 1.0, 2.0])
+def test_an_unknown_shape_is_fitted_once_per_hand(spread):
+    """Keypoints of a hand of any shape are reproduced; with the mean shape they are not."""
+    random, truth, generated = np.random.default_rng(2), {}, {}
+    for side in SIDES:
+        fingers = PAIR[side].mean_pose.reshape(15, 3) * np.linspace(0, 2, 10)[:, None, None]
+        pose = HandPose(random.normal(0, 1, (10, 3)), rotvec_to_rotmat(random.normal(0, 2, (10, 3))), fingers)
+        betas = spread * random.normal(0, 1, 10)
+        truth[side] = skin(side, pose.track(betas, np.ones(10, bool), None))[:, IDS]
+        generated[side] = GeneratedKeypoints(truth[side], np.zeros_like(truth[side]), np.ones(10, bool))
+
+    def miss_m(betas: np.ndarray | None) -> list[float]:
+        tracks = fit_hands(PAIR, betas, IDS, generated)
+        assert all(track.betas.shape == (1, 10) for track in tracks.values())
+        return [float(np.linalg.norm(skin(s, tracks[s])[:, IDS] - truth[s], axis=-1).mean()) for s in SIDES]
+
+    assert max(miss_m(None)) < 0.0005
+    if spread:
+        assert min(miss_m(np.zeros((2, 10)))) > 3 * max(miss_m(None))
+
+
 def test_a_frame_without_the_hand_is_invalid_and_has_finite_numbers():
     generated = touching()["left"]
     generated.keypoints_m[5:9] = np.nan

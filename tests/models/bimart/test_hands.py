@@ -16,7 +16,7 @@ from hoidata.object_paths import ObjectPath, keyframed_path, parse_keyframes
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.keypoints import hand_keypoints
 from hoidata.sensors.part_bps import BasisSettings
-from models.bimart.family import BimArtSampler, FamilyConfig
+from models.bimart.family import BimArtSampler
 from models.bimart.hands import HandSamplingOptions, SampledHands, hands_for
 from models.bimart.network import ContactModel, DenoiserConfig, MotionModel
 from models.bimart.sampler import OURS, BimArt, BimArtSamplerConfig
@@ -53,7 +53,7 @@ def sampler() -> BimArtSampler:
         contact.scale.fill_(0.005)
     sampling = replace(OURS, sampler=BimArtSamplerConfig("ddim", 2, 0.5))
     model = BimArt(contact.eval(), motion.eval(), sampling, torch.device("cpu"))
-    return BimArtSampler(model, PAIR, FamilyConfig(), synthetic=True)
+    return BimArtSampler(model, PAIR, synthetic=True)
 
 
 @pytest.fixture(scope="module")

@@ -56,9 +56,14 @@ def test_the_papers_networks_and_training_have_the_numbers_of_section_3_5() -> N
         network, training = plan.network, plan.training
         assert (network.transformer.layers, network.transformer.width) == (8, 512)
         assert (network.diffusion_steps, network.latents, network.condition_on_hands) == (50, "concatenate", False)
+        assert (network.noise_schedule, network.knot_frames, network.signal_scale) == ("linear", 0, 1)
+        assert (network.encoder, network.transformer.heads, network.transformer.norm_first) == ((1024, 1024), 4, False)
+        assert (network.min_std_fraction, network.transformer.frames_per_token) == (0, 1)
         features = network.features
         assert (features.basis.nearest, features.basis.frame, features.state) == ("vertex", "axis", "pose")
-        assert (features.window_frames, features.max_distance_m) == (64, 0)
+        assert (features.window_frames, features.max_distance_m, features.contact_map_target) == (64, 0, "skin")
+        assert (features.basis.count, features.keypoints) == (512, 100)
+        assert (training.batch, training.steps) == (100, 218_000)
         assert (training.learning_rate, training.weight_decay, training.schedule) == (1e-4, 0, "cosine")
         assert training.ema_decay > 0
         assert isinstance(plan.loss, LossConfig)
