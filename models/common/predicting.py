@@ -1,6 +1,7 @@
 """Samples a family's motions for a dataset's test clips, and writes them as a store of clips."""
 
 import json
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from hashlib import sha256
@@ -16,12 +17,21 @@ from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request, Sentence, Trajectories
 from hoidata.clips.clip import Clip
 from hoidata.clips.features import GLOBAL_ORIENT_6D
-from hoidata.files import atomic_folder, write_whole
+from hoidata.files import atomic_folder, sha256_file, write_whole
+from hoidata.files.atomic import canonical_json
+from hoidata.files.written import read_json_rows
 from hoidata.hands import HandPair
-from hoidata.metrics.target_contact import TargetDistances, write_target_contact, write_target_distances
+from hoidata.metrics.target_contact import (
+    TargetDistances,
+    read_target_contact,
+    read_target_distances,
+    write_target_contact,
+    write_target_distances,
+)
 from hoidata.settings import build_config, require_at_least
 from hoidata.store.annotated import load_annotated
-from hoidata.store.store import write_store
+from hoidata.store.store import open_store, write_store
+from hoidata.store.windows import WindowedStore, WindowProtocol
 from models.common.checkpoints import FILE_NAME, empty_reason, write_empty
 from models.common.family import Family, Sampler, Skipped, Sources
 
@@ -36,7 +46,8 @@ class PredictionConfig:
 
     samples: int = 8  # per test clip
     seed: int = 0  # of all random numbers
-    clips: int = 0  # evenly spaced test clips; 0: all
+    clips: int = 0  # evenly spaced test clips, or windows; 0: all
+    windows: WindowProtocol | None = None  # windows of the test clips instead of their first frames
 
     def __post_init__(self) -> None:
         require_at_least("sample", self, "samples", 1)
@@ -69,6 +80,7 @@ def sample_family(
     settings: Mapping[str, Any] | None = None,
     encoder: str = "",
     device: str = "cpu",
+    progress: Path | None = None,
 ) -> dict[str, int]:
     """Sample a family's motions for the test clips.
 
@@ -84,6 +96,8 @@ def sample_family(
         params: a :class:`PredictionConfig`.
         settings: section of params.yaml by family.
         encoder: name of the text encoder, for families that read sentences; "": the one that the annotation names.
+        progress: a folder for finished motions, from which an interrupted call continues with the same bytes; it is
+            removed at the end. Delete it after a change of code or data.
 
     Returns:
         Counts of the store.
@@ -92,6 +106,8 @@ def sample_family(
     root, checkpoints = Path(annotated_root), Path(checkpoints)
     reason = _why_not(family, root, checkpoints)
     annotated = None if reason else load_annotated(root, hands)
+    if annotated and config.windows:
+        annotated = WindowedStore(annotated, config.windows)
     test = [] if annotated is None else list(HoiDataset(annotated, "test", crop="start"))
     test = spread(test, config.clips)
     if annotated is None or not test:
@@ -102,8 +118,10 @@ def sample_family(
     with atomic_folder(out) as partial:
         info = annotated.info | {"family": family.name, "sampling_device": sources.device.type}
         info |= {"length": "own"} if family.estimates_length else {}
+        info |= {"windows": asdict(config.windows)} if config.windows else {}
         left_out, contacts = list[Skipped](), dict[str, np.ndarray | TargetDistances]()
-        motions = _motions_of(_motions(family.load(sources), test, config, contacts), left_out)
+        parts = _Parts.of(progress, family, sources, config, info) if progress else None
+        motions = _motions_of(_motions(family.load(sources), test, config, contacts, parts), left_out)
         first = next(motions, None)
         if first is None:
             write_empty(partial, f"no motion of {len(left_out)}: {left_out[0].reason}")
@@ -113,6 +131,8 @@ def sample_family(
         _write(partial / "diagnostics.json", family.diagnose(sources))
         if left_out:
             _write(partial / LEFT_OUT, [asdict(item) for item in left_out])
+    if progress:
+        shutil.rmtree(progress, ignore_errors=True)
     return counts
 
 
@@ -180,22 +200,67 @@ def _motions(
     test: Sequence[ClipSample],
     config: PredictionConfig,
     contacts: dict[str, np.ndarray | TargetDistances],
+    parts: "_Parts | None",
 ) -> Iterator[Clip | Skipped]:
     """The answers in order; adds each motion's contact condition, if the family reports it, to ``contacts``."""
     starts = range(0, len(test), CLIPS_AT_ONCE)
     for start in track(starts, description="sampling", transient=True):
         chosen = test[start : start + CLIPS_AT_ONCE]
         requests = [request for sample in chosen for request in requests_for(sample, config)]
-        if isinstance(sampler, ReportsContact):
-            answers, maps = sampler.sample_with_targets(requests)
-            contacts |= {
-                answer.clip_id: contact_map
-                for answer, contact_map in zip(answers, maps, strict=True)
-                if contact_map is not None
-            }
-        else:
-            answers = sampler.sample(requests)
+        answers, maps = parts.answers(start, sampler, requests) if parts else _answers(sampler, requests)
+        contacts |= maps
         yield from answers
+
+
+def _answers(
+    sampler: Sampler, requests: Sequence[Request]
+) -> tuple[Sequence[Clip | Skipped], dict[str, np.ndarray | TargetDistances]]:
+    """The answers in order, and contact conditions by id of the motion."""
+    if not isinstance(sampler, ReportsContact):
+        return sampler.sample(requests), {}
+    answers, maps = sampler.sample_with_targets(requests)
+    return answers, {
+        answer.clip_id: contact for answer, contact in zip(answers, maps, strict=True) if contact is not None
+    }
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Finished answers in a folder: one store of clips per batch of requests."""
+
+    folder: Path
+    info: dict[str, Any]  # of the stores
+    hands: HandPair
+
+    @classmethod
+    def of(
+        cls, root: Path, family: Family, sources: Sources, config: PredictionConfig, info: dict[str, Any]
+    ) -> "_Parts":
+        """The parts of one request; another family, network, setting or dataset has another folder."""
+        networks = [sha256_file(sources.checkpoints / name / FILE_NAME) for name in family.uses]
+        facts = [family.name, asdict(config), dict(sources.settings), sources.encoder, networks, info]
+        return cls(root / sha256(canonical_json(facts).encode()).hexdigest()[:16], info, sources.hands)
+
+    def answers(
+        self, number: int, sampler: Sampler, requests: Sequence[Request]
+    ) -> tuple[list[Clip | Skipped], dict[str, np.ndarray | TargetDistances]]:
+        """As ``_answers``; sampled only if this part is not in the folder yet."""
+        folder = self.folder / f"{number:05d}"
+        if not (folder / LEFT_OUT).is_file():
+            answers, maps = _answers(sampler, requests)
+            skipped = [answer for answer in answers if isinstance(answer, Skipped)]
+            with atomic_folder(folder) as partial:
+                write_store(
+                    partial / "clips", [answer for answer in answers if not isinstance(answer, Skipped)], self.info
+                )
+                _write_asked(partial, maps)
+                _write(partial / LEFT_OUT, [asdict(item) for item in skipped])
+        store = open_store(folder / "clips", self.hands)
+        rows = read_json_rows(folder / LEFT_OUT, {"clip_id": str, "reason": str})
+        reasons = {row["clip_id"]: row["reason"] for row in rows}
+        maps = read_target_contact(store.folder) | read_target_distances(store.folder)
+        ids = [request.motion_id for request in requests]
+        return [Skipped(name, reasons[name]) if name in reasons else store.clip(name) for name in ids], maps
 
 
 def _why_not(family: Family, root: Path, checkpoints: Path) -> str | None:

@@ -27,7 +27,9 @@ def sample(paths: StagePaths, params: dict, family: str) -> None:
     from models.registry import load_family
 
     section = dict(params.get("sample") or {})
-    settings = {name: section.pop(name) for name in list(section) if isinstance(section[name], dict)}
+    settings = {
+        name: section.pop(name) for name in list(section) if isinstance(section[name], dict) and name != "windows"
+    }
     make_repeatable(threads=1)
     counts = sample_family(
         load_family(family),
