@@ -30,6 +30,7 @@ from models.common.family import Family, Figures, Skipped, Sources, motion_clip,
 
 NO_OBJECT_MOTION = "this method needs the motion of an object, and the request has none"
 NO_OTHER = {"other path": "no training clip of its object", "other object": "all training clips are of its object"}
+MAX_ACTIVE_M = 0.2  # a hand farther than this from the object is not active in a frame
 DIAGNOSED_SAMPLES, DIAGNOSED_CLIPS = 10, 32
 MAX_BATCH_SIZE = 16  # motions of one length that share a batch
 Change = Literal["none", "other path", "other object", "zero map"]
@@ -160,24 +161,11 @@ class BimArtSampler:
         hand_vertices = np.arange(N_VERTICES) if features.contact_map_target == "skin" else keypoint_ids
         return TargetDistances(points_m.astype(np.float32), distance_m, hand_vertices)
 
-    def keypoints_in_world(self, request: Request, motion: SampledMotion) -> dict[Side, GeneratedKeypoints]:
-        """Keypoints and vectors to the object in the world, of active hands."""
-        world = world_from_canonical(request, self._requested_scene(request))
-        # The fit reads a NaN keypoint as a frame without this hand, so non-finite values must be refused here.
-        refuse_not_finite(request, motion.keypoints_m[request.active_hands], motion.to_object_m[request.active_hands])
-        return {
-            side: GeneratedKeypoints(
-                world @ motion.keypoints_m[side_index].astype(np.float64),
-                world.turn(motion.to_object_m[side_index].astype(np.float64)),
-                motion.active[side_index],
-            )
-            for side_index, side in enumerate(SIDES)
-            if request.active_hands[side_index]
-        }
-
     def clip(self, request: Request, motion: SampledMotion) -> Clip:
         """Fit hands to the sampled keypoints, and refine them against the object."""
-        hands, clip = self.keypoints_in_world(request, motion), clip_without_hands(request, self.synthetic)
+        world = world_from_canonical(request, self._requested_scene(request))
+        hands = keypoints_in_world(request, world, motion.keypoints_m, motion.to_object_m)
+        clip = clip_without_hands(request, self.synthetic)
         ids = self.model.motion.keypoint_ids.cpu().numpy()
         tracks = fit_hands(self.pair, None if self.fits_shape else request.betas, ids, hands, request.template_m)
         if self.refinement != "none":
@@ -207,6 +195,27 @@ def world_from_canonical(request: Request, scene: Scene) -> RigidTransform:
     rotation, offset = request.world_from_model[:3, :3], request.world_from_model[:3, 3]
     body = scene.model_from_canonical
     return RigidTransform(rotation @ body.rotation, body.translation @ rotation.T + offset)
+
+
+def keypoints_in_world(
+    request: Request, world: RigidTransform, keypoints_m: np.ndarray, to_object_m: np.ndarray
+) -> dict[Side, GeneratedKeypoints]:
+    """Keypoints and vectors to the object (side, frame, keypoint, 3) of active hands, canonical frame, in the world.
+
+    A hand farther than ``MAX_ACTIVE_M`` from the object is not active in a frame.
+    """
+    # The fit reads a NaN keypoint as a frame without this hand, so non-finite values must be refused here.
+    refuse_not_finite(request, keypoints_m[request.active_hands], to_object_m[request.active_hands])
+    near = np.linalg.norm(to_object_m, axis=-1).min(axis=-1) < MAX_ACTIVE_M
+    return {
+        side: GeneratedKeypoints(
+            world @ keypoints_m[side_index].astype(np.float64),
+            world.turn(to_object_m[side_index].astype(np.float64)),
+            near[side_index],
+        )
+        for side_index, side in enumerate(SIDES)
+        if request.active_hands[side_index]
+    }
 
 
 def clip_without_hands(request: Request, synthetic: bool) -> Clip:

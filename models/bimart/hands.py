@@ -16,12 +16,12 @@ from hoidata.clips.clip import FPS, SIDES, Clip, HandType, ObjectTrack, Side
 from hoidata.clips.features import object_features, upright
 from hoidata.errors import BadInput
 from hoidata.hands import track_vertices
+from hoidata.objects.model import articulate
 from hoidata.objects.sampling import SampledPoints, sample_points
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.part_bps import distance_map
 from models.bimart.family import BimArtSampler
 from models.bimart.sampler import SampledMotion
-from models.bimart.scene import Scene
 
 MIN_FRAMES = 8
 TOUCH_M = 0.005
@@ -58,7 +58,7 @@ class SampledHands:
     before: Clip  # without refinement
     points: SampledPoints
     reached_m: np.ndarray  # (2, frame, point) distance from each point to the nearest vertex of each hand
-    asked_m: np.ndarray  # (2, point) target distance of the contact map, least over all frames; inf: not in the map
+    target_m: np.ndarray  # (2, frame, point) float16 target distance of the contact map; inf for an inactive hand
     standing: ContactMeasures
     unrefined_measures: ContactMeasures  # of ``before``
     seed: int
@@ -146,7 +146,7 @@ def _sample_motion(
         before=unrefined_clip,
         points=points,
         reached_m=distance_m,
-        asked_m=_target_distances(sampler, request, motion, points_world_m),
+        target_m=_target_distances(sampler, request, motion, points, object_track),
         standing=contact_measures(refined_clip, sampler),
         unrefined_measures=contact_measures(unrefined_clip, sampler),
         seed=request.seed,
@@ -155,20 +155,15 @@ def _sample_motion(
 
 
 def _target_distances(
-    sampler: BimArtSampler, request: Request, motion: SampledMotion, points_m: np.ndarray
+    sampler: BimArtSampler, request: Request, motion: SampledMotion, points: SampledPoints, object_track: ObjectTrack
 ) -> np.ndarray:
-    """(2, point) least target distance over the contact map's object points that are nearest to each sampled point.
-
-    points_m: (frame, point, 3) the sampled points, world.
-    """
-    assert request.trajectories is not None
-    scene = Scene.of(request.object, request.trajectories.object, sampler.model.motion.config.features.basis)
-    rotation, offset = request.world_from_model[:3, :3], request.world_from_model[:3, 3]
-    object_points_m = (scene.model_from_canonical @ scene.object_point_m.astype(np.float64)) @ rotation.T + offset
-    target_m = np.full((2, points_m.shape[1]), np.inf, np.float32)
-    maps = motion.contact_m.reshape(len(object_points_m), 2, -1)
-    for frame, frame_points_m in enumerate(points_m):
-        nearest = KDTree(frame_points_m).query(object_points_m[frame, scene.point_exists])[1]
+    """(2, frame, point) float16 target distance of the contact map's object point nearest to each sampled point."""
+    target = sampler.contact_target(request, motion)
+    points_m = articulate(points.points_m, points.part, object_track.model.hinge, object_track.hinge_rad)
+    distance_m = np.full((2, object_track.n_frames, points_m.shape[1]), np.inf, np.float16)
+    for frame, frame_points_m in enumerate(np.broadcast_to(points_m, (object_track.n_frames, *points_m.shape[1:]))):
         for side in np.flatnonzero(request.active_hands):
-            np.minimum.at(target_m[side], nearest, maps[frame, side, scene.point_exists])
-    return target_m
+            known = np.isfinite(target.distance_m[frame, side])
+            nearest = KDTree(target.place_m[frame, known]).query(frame_points_m)[1]
+            distance_m[side, frame] = target.distance_m[frame, side, known][nearest]
+    return distance_m

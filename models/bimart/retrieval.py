@@ -8,7 +8,7 @@ import torch
 
 from hoidata.batches.dataset import ClipSample
 from hoidata.batches.requests import Request
-from hoidata.clips.clip import SIDES, Clip, Side
+from hoidata.clips.clip import Clip, Side
 from hoidata.clips.features import GLOBAL_ORIENT_6D, HAND_FEATURES, WRIST
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d
 from hoidata.geometry.transform import RigidTransform
@@ -17,8 +17,7 @@ from hoidata.refinement import GeneratedKeypoints, fit_hands, refine_hands
 from hoidata.sensors.keypoints import hand_keypoints
 from hoidata.sensors.part_bps import BasisSettings
 from models.baselines.families import NO_MEAN
-from models.bimart.family import clip_without_hands, training_clips, world_from_canonical
-from models.bimart.sampler import MAX_ACTIVE_M
+from models.bimart.family import clip_without_hands, keypoints_in_world, training_clips, world_from_canonical
 from models.bimart.scene import FeatureConfig, RecordedClip, Scene, recorded_clip
 from models.common.family import Family, SingleRequestSampler, Skipped, Sources, motion_clip
 from models.common.features import proper_hands
@@ -185,17 +184,7 @@ class RefinedWindow(SingleRequestSampler):
         windows = [(self._recorded(request, number), frames) for number, frames in self.nearest.windows(request, scene)]
         keypoints = np.concatenate([clip.keypoints_m[:, frames] for clip, frames in windows], axis=1)
         to_object = np.concatenate([clip.to_object_m[:, frames] for clip, frames in windows], axis=1)
-        near = np.linalg.norm(to_object, axis=-1).min(axis=-1) < MAX_ACTIVE_M
-        world = world_from_canonical(request, scene)
-        return {
-            side: GeneratedKeypoints(
-                world @ keypoints[side_index].astype(np.float64),
-                world.turn(to_object[side_index].astype(np.float64)),
-                near[side_index],
-            )
-            for side_index, side in enumerate(SIDES)
-            if request.active_hands[side_index]
-        }
+        return keypoints_in_world(request, world_from_canonical(request, scene), keypoints, to_object)
 
     def _recorded(self, request: Request, number: int) -> RecordedClip:
         sample = self.nearest.clips[active_hands_of(request)][number].sample

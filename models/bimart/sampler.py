@@ -33,7 +33,6 @@ from models.common.sampling import SamplerConfig, sample
 
 MAX_PAIRS = 1 << 22  # of object points and keypoints in one distance matrix
 GUIDANCE_RANGE_M = 0.02  # weights of object points decay with their target distance, by 1/e in this
-MAX_ACTIVE_M = 0.2  # a hand farther than this from the object is not active in a frame
 
 
 @dataclass(frozen=True)
@@ -192,7 +191,6 @@ class SampledMotion:
     contact_m: np.ndarray  # (frame, 2N) target distances
     keypoints_m: np.ndarray  # (side, frame, keypoint, 3)
     to_object_m: np.ndarray  # (side, frame, keypoint, 3) vectors from keypoints to the object
-    active: np.ndarray  # (side, frame) bool, near the object
 
 
 @dataclass(frozen=True)
@@ -227,8 +225,8 @@ class BimArt:
         sampled_maps = self._sample_maps(tasks, generators)
         contact = sampled_maps if contact_m is None else contact_m.to(sampled_maps)
         motion = self.motion.decode(self._sample(self.motion, tasks, generators, contact))
-        arrays = zip(tasks, contact.cpu().numpy(), motion.cpu().numpy(), strict=True)
-        return [self._sampled_motion(*item) for item in arrays]
+        arrays = zip(contact.cpu().numpy(), motion.cpu().numpy(), strict=True)
+        return [SampledMotion(contact_m, *split_motion(values)) for contact_m, values in arrays]
 
     @torch.no_grad()
     def sample_maps(self, tasks: Sequence[SamplingTask]) -> np.ndarray:
@@ -260,11 +258,11 @@ class BimArt:
         encoded = network.prepare(self._windows(network, tasks, layout, contact_m))
         noise = torch.stack([torch.randn(frames, size, generator=generator) for generator in generators])
         noise = send(noise, self.device)
-        if contact_m is None:
-            denoise = _plain_denoiser(network, encoded, layout)
-        else:
+        target, weight = None, 0.0
+        if contact_m is not None:
+            weight = self.config.sampler.guidance
             target = None if self.config.contact_guidance == "off" else self._contact_target(tasks, contact_m)
-            denoise = self._guided_denoiser(network, encoded, layout, target)
+        denoise = self._denoiser(network, encoded, layout, weight, target)
         return sample(denoise, noise, self.config.sampler, generators, network.config.noise_schedule)
 
     def _windows(
@@ -284,17 +282,17 @@ class BimArt:
         # A distance at the clamp is a lower bound only.
         return ContactTarget(points, contact_m, mask & (contact_m < 0.99 * max_m) if max_m else mask)
 
-    def _guided_denoiser(
-        self, network: Denoiser, encoded: EncodedWindows, layout: Layout, target: ContactTarget | None
+    def _denoiser(
+        self, network: Denoiser, encoded: EncodedWindows, layout: Layout, weight: float, target: ContactTarget | None
     ) -> Callable[[Tensor, Tensor], Tensor]:
-        """The motion model with contact guidance and classifier-free guidance."""
-        config, calls, doubled = self.config, 0, encoded.doubled()
+        """A network with classifier-free guidance of some weight, and contact guidance if there is a target."""
+        config, calls, doubled = self.config, 0, encoded.doubled() if weight else encoded
 
         def denoise(x: Tensor, steps: Tensor) -> Tensor:
             nonlocal calls
             calls += 1
             windows, window_steps = layout.cut(x), steps.repeat_interleave(len(layout.starts))
-            if config.sampler.guidance == 0:
+            if weight == 0:
                 clean = layout.joined(network.denoise(windows, window_steps, encoded, encoded.conditional))
                 unconditional = None
             else:
@@ -305,7 +303,7 @@ class BimArt:
                 clean = self._guide_keypoints(clean, target)
             if unconditional is None:
                 return clean
-            return combined(clean, unconditional, config.sampler.guidance, config.guidance_rule)
+            return combined(clean, unconditional, weight, config.guidance_rule)
 
         return denoise
 
@@ -320,20 +318,7 @@ class BimArt:
             step = metre_step(keypoints, target) / scale
         return torch.cat((clean[..., :half] + step.flatten(2), clean[..., half:]), -1)
 
-    def _sampled_motion(self, task: SamplingTask, contact_m: np.ndarray, motion: np.ndarray) -> SampledMotion:
-        keypoints, to_object = split_motion(motion)
-        near = np.linalg.norm(to_object, axis=-1).min(axis=-1) < MAX_ACTIVE_M
-        return SampledMotion(contact_m, keypoints, to_object, near & self._active_hands(task)[:, None])
-
 
 def _shared_features(features: FeatureConfig) -> FeatureConfig:
     """The features that both networks of a pair must have in common; the others are set to fixed values."""
     return replace(features, state="local", window_frames=0)
-
-
-def _plain_denoiser(network: Denoiser, encoded: EncodedWindows, layout: Layout) -> Callable[[Tensor, Tensor], Tensor]:
-    def denoise(x: Tensor, steps: Tensor) -> Tensor:
-        window_steps = steps.repeat_interleave(len(layout.starts))
-        return layout.joined(network.denoise(layout.cut(x), window_steps, encoded, encoded.conditional))
-
-    return denoise

@@ -28,6 +28,7 @@ from pipelines.pages.player import Player, contact_player, css_colour, motion_pl
 from pipelines.pages.surface import ContactPaint
 
 FACES_OF_STILLS = 8_000
+MAPS_OVER_TIME = 5  # frames, evenly spaced, whose target contact maps are on the page
 FADES_M = 0.02  # where paint ends
 
 # Every array of motion.npz. Axes: S = 2 sides (left, right), F frames, P object points.
@@ -39,7 +40,7 @@ ARRAYS = SHARED | {
     "contact_points_m": "(P, 3) points of the object, in its frame",
     "contact_part": "(P,) 1 where the hinge moves the point",
     "contact_distance_m": "(S, F, P) float16 distance of each point to the nearest vertex of the hand",
-    "asked_distance_m": "(S, P) the target of the contact model for the least distance over all frames; infinite: none",
+    "target_distance_m": "(S, F, P) float16 the same distance as the contact model requests it; infinite: no such hand",
 }
 
 
@@ -108,7 +109,7 @@ def hands_arrays(motion: SampledHands, hands: HandPair, made_from: Mapping[str, 
         "contact_points_m": motion.points.points_m,
         "contact_part": motion.points.part,
         "contact_distance_m": motion.reached_m.astype(np.float16),
-        "asked_distance_m": motion.asked_m,
+        "target_distance_m": motion.target_m,
     }
 
 
@@ -127,23 +128,30 @@ def _shown(motion: SampledHands, hands: HandPair, steps: Sequence[PathStep]) -> 
     }
 
 
-def _map(motion: SampledHands, side: Side, title: str) -> tuple[Player, Player, str]:
-    """Players of the target and the generated contact map of one hand, and their agreement in words."""
+def _map(motion: SampledHands, side: Side, title: str) -> tuple[Player, Player, str, list[Player]]:
+    """Players of the target and the generated contact map of one hand, their agreement in words, and target maps."""
     side_index = SIDES.index(side)
-    target_m, reached_m = motion.asked_m[side_index], motion.reached_m[side_index].min(axis=0)
+    target_m, reached_m = motion.target_m[side_index].min(axis=0), motion.reached_m[side_index].min(axis=0)
     still = simplified_for_page(motion.clip, FACES_OF_STILLS)
     paints = {"target": _paint(motion, target_m), "generated": _paint(motion, reached_m)}
     first, second = (
         contact_player(still, paint, f"{title}, {side} hand, {name}", f"{side} hand, {name}", name, paints["generated"])
         for name, paint in paints.items()
     )
+    over_time = []
+    for frame in np.linspace(0, motion.clip.n_frames - 1, MAPS_OVER_TIME).round().astype(int).tolist():
+        paint, words = _paint(motion, motion.target_m[side_index, frame]), f"{frame / FPS:.2f} s"
+        posed = still.take(slice(frame, frame + 1))
+        over_time.append(
+            contact_player(posed, paint, f"{title}, {side} hand, {words}", words, "target", paints["target"])
+        )
     near = target_m < FADES_M
     if not near.any():
-        return first, second, f"{side} hand: no target contact"
+        return first, second, f"{side} hand: no target contact", over_time
     error_cm = 100 * np.abs(target_m - reached_m)[near].mean()
     percent = 100 * (reached_m[near] < FADES_M).mean()
     words = f"{near.sum()} target points within {100 * FADES_M:.0f} cm, {percent:.0f} % reached"
-    return first, second, f"{side} hand: {words}; distances differ by {error_cm:.1f} cm on average"
+    return first, second, f"{side} hand: {words}; distances differ by {error_cm:.1f} cm on average", over_time
 
 
 def _paint(motion: SampledHands, distance_m: np.ndarray) -> ContactPaint:

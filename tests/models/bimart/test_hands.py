@@ -8,11 +8,14 @@ import pytest
 import torch
 from scipy.spatial import KDTree
 
+from hoidata.batches.requests import ObjectPoints, Request, Trajectories
 from hoidata.clips.clip import SIDES
+from hoidata.clips.features import object_features
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.metrics.verdict import verdict
 from hoidata.object_paths import ObjectPath, keyframed_path, parse_keyframes
+from hoidata.objects.model import articulate
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.keypoints import hand_keypoints
 from hoidata.sensors.part_bps import BasisSettings
@@ -20,9 +23,9 @@ from models.bimart.family import BimArtSampler
 from models.bimart.hands import HandSamplingOptions, SampledHands, hands_for
 from models.bimart.network import ContactModel, DenoiserConfig, MotionModel
 from models.bimart.sampler import OURS, BimArt, BimArtSamplerConfig
-from models.bimart.scene import FeatureConfig
+from models.bimart.scene import FeatureConfig, Scene
 from models.common.transformer import TransformerConfig
-from pipelines.pages.hands_page import ARRAYS, write_hands
+from pipelines.pages.hands_page import ARRAYS, MAPS_OVER_TIME, write_hands
 from tests.builders.objects import hinged_box
 
 pytestmark = pytest.mark.slow
@@ -91,7 +94,8 @@ def test_only_the_requested_hand_is_sampled(sampler, path):
     assert not left.clip.hands["right"].valid.any()
     assert list(left.standing.touching) == ["left"]
     assert np.isinf(left.reached_m[1]).all()
-    assert np.isinf(left.asked_m[1]).all()
+    assert np.isinf(left.target_m[1]).all()
+    assert np.isfinite(left.target_m[0]).all()
 
 
 def test_contact_measures_equal_those_of_the_hand_meshes(motions):
@@ -107,8 +111,37 @@ def test_contact_measures_equal_those_of_the_hand_meshes(motions):
         vertices_object_m = object_track.world_from_object.inverse() @ vertices_m.astype(np.float64)
         distance = index.distance_m(vertices_object_m, object_track.hinge_rad).min(axis=1)
         assert np.array_equal(motion.standing.touching[side], distance < 0.005)
-    assert np.isfinite(motion.asked_m).sum() > 20
     assert motion.standing.deepest_m.max() < motion.unrefined_measures.deepest_m.max()
+
+
+def test_target_distances_of_a_frame_are_those_of_the_nearest_points_of_the_contact_map(sampler, path):
+    (motion,) = hands_for(sampler, path.track, HandSamplingOptions(seed=3))
+    track, frame = path.track, 20
+    wrists = np.zeros((2, track.n_frames, 9), np.float32), np.zeros((2, track.n_frames), bool)
+    features = object_features(track, np.eye(3), track.translation_m[0].astype(np.float64))
+    request = Request(
+        "m",
+        object=track.model,
+        points=ObjectPoints(motion.points.points_m, motion.points.normals, motion.points.part),
+        text=np.zeros(512, np.float32),
+        active_hands=np.ones(2, bool),
+        n_frames=track.n_frames,
+        seed=motion.seed,
+        trajectories=Trajectories(*wrists, features),
+    )
+    (sampled,) = sampler.sample_motions([request])
+    scene = Scene.of(track.model, features, FEATURES.basis)
+    exists = scene.point_exists
+    places_m = (scene.object_from_canonical @ scene.object_point_m.astype(np.float64))[frame, exists]
+    points = motion.points
+    posed_m = articulate(points.points_m, points.part, track.model.hinge, track.hinge_rad)[frame]
+    apart = np.linalg.norm(posed_m[:, None] - places_m, axis=-1)
+    for side in range(2):
+        maps = sampled.contact_m.reshape(track.n_frames, 2, -1)[frame, side, exists]
+        is_nearest = apart < apart.min(axis=1, keepdims=True) + 1e-6  # several basis points may have one vertex
+        agrees = np.isclose(motion.target_m[side, frame][:, None], maps, rtol=2e-3, atol=1e-5)
+        assert (agrees & is_nearest).any(axis=1).all()
+    assert not np.array_equal(motion.target_m[:, frame], motion.target_m[:, 2])
 
 
 def test_too_short_a_motion_is_bad_input(sampler, path):
@@ -137,10 +170,12 @@ def test_files_and_page_are_repeatable_and_each_array_is_documented(motions, pat
     assert [file.read_bytes() for file in first] == [file.read_bytes() for file in again]
     with np.load(first[0]) as arrays:
         assert set(arrays.files) == set(ARRAYS)
-        assert arrays["contact_distance_m"].shape == (2, path.track.n_frames, len(arrays["contact_points_m"]))
+        shape = 2, path.track.n_frames, len(arrays["contact_points_m"])
+        assert arrays["contact_distance_m"].shape == arrays["target_distance_m"].shape == shape
+        assert np.array_equal(arrays["target_distance_m"], motions[0].target_m)
         assert np.array_equal(arrays["object_hinge_axis"], path.track.model.hinge.axis)
     page = first[-1].read_text(encoding="utf-8")
-    assert page.count('<figure class="player') == 2 * (2 + 4)
+    assert page.count('<figure class="player') == 2 * (2 + 2 * (2 + MAPS_OVER_TIME))
     assert "keyframes 2 to 3" in page
     assert page.count("does not pierce") >= 2
     assert "a &lt;script&gt;" in page
