@@ -89,7 +89,7 @@ def generate_files(request: GenerationRequest, out: Path) -> WrittenFiles:
         points=models.points,
     )
     generator = replace(generator, model=generator.model.with_sampler(**request.sampler))
-    ups = generator.model.object_ups
+    ups = generator.object_ups
     in_training = user is None and (not ups or model.name in ups)
     motions = generator.generate(wording.text, model, request.options, noun if user else None, in_training)
     evidence, hand = motions[0].evidence, motions[0].evidence["hand"]

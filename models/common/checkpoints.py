@@ -14,10 +14,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from hoidata.annotation.encoders import TextEncoder, refuse_other_encoder
 from hoidata.errors import BadInput
 from hoidata.files import canonical_json, write_whole
 from hoidata.files.checksums import EMPTY_CHECKSUMS, METADATA_KEY, sealed, verify_checksums
 from hoidata.files.written import EMPTY, empty_reason
+from hoidata.hands import HandPair
 from hoidata.settings import build_config, plain_config
 from models.common.family import StoredNetwork
 from models.common.features import Normaliser
@@ -120,3 +122,13 @@ def write_empty(folder: str | Path, reason: str) -> Path:
 
 def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+
+
+def refuse_other_inputs(checkpoint: Checkpoint, hands: HandPair, encoder: TextEncoder, source: Path) -> None:
+    """Raise BadInput if a network was trained with another hand model or text encoder."""
+    facts = checkpoint.facts
+    if facts["hand_digest"] != hands.digest:
+        remedy = "pass the hand the models were trained with, or train with this one"
+        expected = f"hand {facts['hand']} {facts['hand_digest'][:12]}"
+        raise BadInput(source, expected, f"{hands.name} {hands.digest[:12]}", remedy)
+    refuse_other_encoder(source, facts["encoder"], encoder.identity)

@@ -10,28 +10,23 @@ from cachetools import LRUCache, cachedmethod
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
-from hoidata.actions.action import Actions
 from hoidata.annotation.vocabulary import Vocabulary
 from hoidata.batches.dataset import ClipBatch, ClipSample, collate
 from hoidata.clips.features import GLOBAL_ORIENT_6D
 from hoidata.devices import send
 from hoidata.geometry.rotations import rot6d_to_rotmat
-from hoidata.hands import HandPair
-from hoidata.metrics.verb_ranges import VerbRanges, training_ranges
-from hoidata.metrics.verdict import object_ups
 from models.common import losses
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
 from models.common.family import Losses, Network, Objective, Setup
 from models.common.features import Hands, Normaliser, object_rotmat, place_points, to_object_frame
 from models.common.sampling import TRAIN_STEPS, Motion, add_noise, alphas_cumprod
+from models.common.training_ranges import ranges_record
 from models.text2hoi.contact_training import CONTACT, ContactNetwork, SampleContact, contact_sampler
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
 from models.text2hoi.motion_representation import EncodedClip, MotionRepresentation
 
 TOUCH_WEIGHT = 4.0
-ACTIONS = "actions"  # name of the training clips' usual ranges among the results of a checkpoint
-OBJECT_UPS = "object_ups"  # likewise, of ``hoidata.metrics.verdict.object_ups``
 DISTANCE_ENTRIES = 8192  # of a batch, in Eq. 6
 MAX_CACHED_CLIPS = 16_384  # of about 150 kB each, at most
 VALIDATION_STEPS = (100, 300, 500, 700, 900)
@@ -227,12 +222,6 @@ def motion_generator(checkpoint: Checkpoint) -> MotionGenerator:
     return MotionGenerator(checkpoint.network, checkpoint.normaliser)
 
 
-def verb_ranges(checkpoint: Checkpoint, hands: HandPair) -> VerbRanges | None:
-    """The usual ranges of a diffusion checkpoint's training clips; None if it has none."""
-    record, facts = checkpoint.info.get("results", {}).get(ACTIONS), checkpoint.facts
-    return None if record is None else VerbRanges(Actions.read(record), facts["contact_threshold_m"], hands)
-
-
 def _diffusion_objective(setup: Setup) -> tuple[Objective, Normaliser]:
     contact = setup.trained["contact"].network
     assert isinstance(contact, ContactNetwork)
@@ -270,8 +259,5 @@ DIFFUSION = Network(
     objective=_diffusion_objective,
     loss=DiffusionLossConfig,
     needs=(CONTACT.name,),
-    results=lambda network, corpus: {
-        ACTIONS: training_ranges(corpus.annotated).record,
-        OBJECT_UPS: object_ups(corpus.annotated),
-    },
+    results=lambda network, corpus: ranges_record(corpus.annotated),
 )

@@ -4,7 +4,6 @@ Text2HOI, Sec. 3 and 4.1. A motion is a :class:`Clip` of dataset "generated" in 
 zero in the first frame. All random numbers come from one seed: the same seed gives the same bytes.
 """
 
-from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -12,31 +11,26 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from hoidata.annotation.encoders import TextEncoder, load_encoder, refuse_other_encoder
+from hoidata.annotation.encoders import TextEncoder, load_encoder
 from hoidata.annotation.hand_choice import HandChoice, Method
 from hoidata.annotation.sentence_check import unseen_words
 from hoidata.annotation.vocabulary import Vocabulary
 from hoidata.annotation.wording import understood_words
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import ObjectPoints, Request, Sentence
-from hoidata.clips.clip import FPS, SIDES, Clip, HandType, Side
-from hoidata.clips.features import upright
+from hoidata.clips.clip import FPS, SIDES, Clip, HandType
 from hoidata.errors import BadInput
 from hoidata.files import sha256_file
-from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
-from hoidata.hands import HandPair, load_embedded_hands, track_joints
-from hoidata.metrics.unmeasured import Unmeasured
-from hoidata.metrics.verdict import UNKNOWN_UP, Check, RequestedVerb, verdict
-from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.hands import HandPair, load_embedded_hands
+from hoidata.metrics.verdict import UNKNOWN_UP, Check, verdict
+from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import POINT_COUNT, SampledPoints, sample_points
-from hoidata.objects.surface_index import surface_index
-from models.common.checkpoints import FILE_NAME, Checkpoint
+from models.common.checkpoints import FILE_NAME, refuse_other_inputs
 from models.common.family import motion_clip
-from models.text2hoi.diffusion_training import verb_ranges
+from models.common.object_frame import Z, closed_as_stored, training_from_z_up, turned, turned_back
+from models.common.training_ranges import object_ups, requested_verb, verb_ranges
 from models.text2hoi.length import SHORTEST_FRAMES
 from models.text2hoi.sampler import Answer, SamplingConfig, Text2Hoi
-
-Z = (0.0, 0.0, 1.0)
 
 
 class Evidence(TypedDict):
@@ -121,9 +115,13 @@ class Generator:
         model = Text2Hoi.load(checkpoints, hands, sampling, device)
         encoder = encoder or load_encoder(str(model.facts["encoder"]["name"]))
         for checkpoint in model.trained.values():
-            _refuse_others(checkpoint, hands, encoder, Path(checkpoints))
+            refuse_other_inputs(checkpoint, hands, encoder, Path(checkpoints))
         digests = {name: sha256_file(Path(checkpoints) / name / FILE_NAME) for name in model.trained}
         return cls(model, hands, encoder, Vocabulary.read(model.trained["contact"].facts), digests, points)
+
+    @property
+    def object_ups(self) -> dict[str, list[float]]:
+        return object_ups(self.model.trained["diffusion"])
 
     def generate(
         self,
@@ -143,14 +141,11 @@ class Generator:
             BadInput: the text is not an English sentence, or the length is not within 8 to 150 frames.
         """
         wording = understood_words(text, self.vocabulary, lambda: self.encoder, force=True)
-        hand = self._hand(text, options)
-        cloud, turn = (
-            sample_points(object, self.points),
-            np.eye(3, dtype=np.float32) if in_training else self._training_from_z_up(),
-        )
+        hand, cloud = self._hand(text, options), sample_points(object, self.points)
+        turn = np.eye(3, dtype=np.float32) if in_training else training_from_z_up(self.object_ups)
         first = Request(
             motion_id=f"generated/{object.name}",
-            object=_turned(object, turn),
+            object=turned(object, turn),
             points=ObjectPoints(cloud.points_m @ turn.T, cloud.normals @ turn.T, cloud.part),
             text=self.encoder.encode([wording.text])[0],
             sentence=Sentence(wording.text, wording.verb, wording.noun),
@@ -168,32 +163,16 @@ class Generator:
             evidence = self._evidence(request, answer, hand, options, object_words or wording.noun)
             clip, coarse = answer.clip, motion_clip(request, answer.coarse, answer.object, evidence["synthetic"])
             if not in_training:
-                clip, coarse = (closed_as_stored(_turned_back(one, object, turn), self.hands) for one in (clip, coarse))
-            up = self.model.object_ups.get(object.name) if in_training else Z
-            checks = verdict(
-                clip,
-                self.hands,
-                UNKNOWN_UP if up is None else np.asarray(up),
-                self._requested(wording.verb, clip, cloud),
-            )
+                clip, coarse = (closed_as_stored(turned_back(one, object, turn), self.hands) for one in (clip, coarse))
+            checks = self._verdict(clip, wording.verb, cloud, in_training)
             motions.append(GeneratedMotion(clip, coarse, answer.touched.numpy(), cloud, evidence, checks))
         return motions
 
-    def _training_from_z_up(self) -> np.ndarray:
-        """(3, 3) rotation of z to the axis that is up for most objects of the training clips; identity if not known."""
-        ups = np.asarray(list(self.model.object_ups.values()) or [Z])
-        axes = [tuple(np.where(np.abs(up) == np.abs(up).max(), np.sign(up), 0.0)) for up in ups]
-        # Entries are 0 and 1, so rotations are exact in float32.
-        return np.rint(upright(-np.array(Counter(axes).most_common(1)[0][0]))).T.astype(np.float32)
-
-    def _requested(self, verb: str | None, clip: Clip, cloud: SampledPoints) -> RequestedVerb | Unmeasured:
-        ranges = verb_ranges(self.model.trained["diffusion"], self.hands)
-        if ranges is None:
-            return Unmeasured("the checkpoint has no ranges of its training clips")
-        if verb is None or verb not in self.vocabulary.verbs:
-            return Unmeasured("the sentence has no verb of the training clips")
+    def _verdict(self, clip: Clip, verb: str | None, cloud: SampledPoints, in_training: bool) -> tuple[Check, ...]:
+        up = self.object_ups.get(clip.object.model.name) if in_training else Z
         points = ObjectPoints(cloud.points_m, cloud.normals, cloud.part)
-        return RequestedVerb(verb, ranges, ranges.numbers(clip, points))
+        requested = requested_verb(self.model.trained["diffusion"], self.hands, verb, clip, points)
+        return verdict(clip, self.hands, UNKNOWN_UP if up is None else np.asarray(up), requested)
 
     def _hand(self, text: str, options: MotionOptions) -> HandChoice:
         """The requested hand; otherwise the hand chosen from the sentence, or else by its frequency in training."""
@@ -244,58 +223,3 @@ class Generator:
             "synthetic": bool(model.facts["synthetic"]),
             "checkpoints": {name: self.checkpoints[name] for name in model.trained if name != "length" or needs_length},
         }
-
-
-def _refuse_others(checkpoint: Checkpoint, hands: HandPair, encoder: TextEncoder, source: Path) -> None:
-    """Raise BadInput if a network was trained with another hand model or text encoder."""
-    facts = checkpoint.facts
-    if facts["hand_digest"] != hands.digest:
-        remedy = "pass the hand the models were trained with, or train with this one"
-        expected = f"hand {facts['hand']} {facts['hand_digest'][:12]}"
-        raise BadInput(source, expected, f"{hands.name} {hands.digest[:12]}", remedy)
-    refuse_other_encoder(source, facts["encoder"], encoder.identity)
-
-
-def _turned(model: ObjectModel, rotation: np.ndarray) -> ObjectModel:
-    """The object in a frame that is rotated by ``rotation`` (3, 3)."""
-    if (rotation == np.eye(3)).all():
-        return model
-    hinge = model.hinge and Hinge(rotation @ model.hinge.axis, rotation @ model.hinge.origin_m)
-    return replace(model, vertices_m=model.vertices_m @ rotation.T, hinge=hinge)
-
-
-def _turned_back(clip: Clip, model: ObjectModel, rotation: np.ndarray) -> Clip:
-    """The clip of an object that was ``_turned``, with the object in its own frame."""
-    rotvec = clip.object.rotvec
-    if (rotation != np.eye(3)).any():
-        rotvec = rotmat_to_rotvec(rotvec_to_rotmat(rotvec.astype(np.float64)) @ rotation).astype(np.float32)
-    return replace(clip, object=replace(clip.object, model=model, rotvec=rotvec))
-
-
-def closed_as_stored(clip: Clip, hands: HandPair) -> Clip:
-    """The clip with the least hinge angle at 0, as the mesh is stored; hands on the moving part move with it."""
-    track, tracks = clip.object, dict(clip.hands)
-    if track.hinge_rad is None or track.model.hinge is None:
-        return clip
-    least_rad, world_from_object = track.hinge_rad.min(), track.world_from_object
-    moved = world_from_object @ track.model.hinge.turn(np.full(clip.n_frames, -least_rad)) @ world_from_object.inverse()
-    for side, hand in clip.hands.items():
-        if hand.valid.any() and _nearest_part(clip, side, hands) == 1:
-            wrist_m = (moved @ hand.wrist_m[:, None].astype(np.float64))[:, 0].astype(np.float32)
-            rotation = moved.rotation @ rotvec_to_rotmat(hand.global_orient.astype(np.float64))
-            tracks[side] = replace(hand, wrist_m=wrist_m, global_orient=rotmat_to_rotvec(rotation).astype(np.float32))
-    return replace(clip, hands=tracks, object=replace(track, hinge_rad=track.hinge_rad - least_rad))
-
-
-def _nearest_part(clip: Clip, side: Side, hands: HandPair) -> int:
-    """The part of the object that is nearer to the joints of a hand, on average over all frames."""
-    track = clip.object
-    joints_m = track.world_from_object.inverse() @ track_joints(clip.hands[side], hands[side]).astype(np.float64)
-
-    def distance_m(part: int) -> float:
-        in_part_m = track.model.object_from_part(part, track.hinge_rad).inverse() @ joints_m
-        surface = surface_index(track.model).filled[part]
-        distances_m = surface.distance_m(np.ascontiguousarray(in_part_m.reshape(-1, 3))).reshape(joints_m.shape[:2])
-        return float(distances_m.min(axis=1).mean())
-
-    return min(track.model.parts, key=distance_m)

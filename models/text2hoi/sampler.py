@@ -29,9 +29,10 @@ from models.common.checkpoints import FILE_NAME, Checkpoint, load_checkpoint
 from models.common.family import Network, motion_clip
 from models.common.features import Hands
 from models.common.sampling import TRAIN_STEPS, Motion, SamplerConfig, draw_each
+from models.common.training_ranges import verb_ranges
 from models.text2hoi.contact_training import CONTACT, contact_sampler, touched
 from models.text2hoi.diffusion import Condition, MotionGenerator, is_paper
-from models.text2hoi.diffusion_training import DIFFUSION, OBJECT_UPS, motion_generator, verb_ranges
+from models.text2hoi.diffusion_training import DIFFUSION, motion_generator
 from models.text2hoi.length import LENGTH, LengthModel
 from models.text2hoi.refiner import RefinerModel, Surface, refine
 from models.text2hoi.refiner_training import REFINER
@@ -121,11 +122,6 @@ class Text2Hoi:
     def facts(self) -> dict[str, Any]:
         """What the diffusion network was trained on."""
         return self.trained["diffusion"].facts
-
-    @property
-    def object_ups(self) -> dict[str, list[float]]:
-        """Direction of each training object that is up in its first frames; empty for checkpoints without it."""
-        return self.trained["diffusion"].info.get("results", {}).get(OBJECT_UPS, {})
 
     def verb_of(self, request: Request) -> str | None:
         """The verb of a request's sentence, base form; None if the grammar finds none."""

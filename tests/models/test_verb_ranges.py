@@ -14,7 +14,8 @@ from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.metrics.verb_ranges import VerbRanges, training_ranges
 from hoidata.store.annotated import AnnotatedStore
 from models.common.checkpoints import Checkpoint, load_checkpoint
-from models.text2hoi.diffusion_training import DIFFUSION, verb_ranges
+from models.common.training_ranges import verb_ranges
+from models.text2hoi.diffusion_training import DIFFUSION
 
 HANDS = load_embedded_hands()
 
