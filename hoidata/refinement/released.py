@@ -1,8 +1,8 @@
 """Refinement of BimArt as printed (Eqs. 9 to 12) and released: 100 steps of Adam on pose and shape, no data term.
 
 Squared distances to object vertices stand for the printed norms, as in the released code. Two differences to that code:
-the solids of the object's parts decide which vertices are inside, not a ray through the open mesh; and there is no
-weight decay, which would pull hands to the world's origin.
+the solids of the object's parts decide which vertices are inside, not a ray through the open mesh; and weights do not
+decay, because that would pull hands to the world's origin.
 """
 
 from collections.abc import Mapping

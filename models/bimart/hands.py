@@ -163,7 +163,7 @@ def _target_distances(
     distance_m = np.full((2, object_track.n_frames, points_m.shape[1]), np.inf, np.float16)
     for frame, frame_points_m in enumerate(np.broadcast_to(points_m, (object_track.n_frames, *points_m.shape[1:]))):
         for side in np.flatnonzero(request.active_hands):
-            known = np.isfinite(target.distance_m[frame, side])
-            nearest = KDTree(target.place_m[frame, known]).query(frame_points_m)[1]
-            distance_m[side, frame] = target.distance_m[frame, side, known][nearest]
+            has_target = np.isfinite(target.distance_m[frame, side])
+            nearest = KDTree(target.place_m[frame, has_target]).query(frame_points_m)[1]
+            distance_m[side, frame] = target.distance_m[frame, side, has_target][nearest]
     return distance_m

@@ -248,16 +248,16 @@ class _Parts:
         folder = self.folder / f"{number:05d}"
         if not (folder / LEFT_OUT).is_file():
             answers, maps = _answers(sampler, requests)
-            skipped = [answer for answer in answers if isinstance(answer, Skipped)]
+            left_out = [asdict(answer) for answer in answers if isinstance(answer, Skipped)]
             with atomic_folder(folder) as partial:
                 write_store(
                     partial / "clips", [answer for answer in answers if not isinstance(answer, Skipped)], self.info
                 )
                 _write_asked(partial, maps)
-                _write(partial / LEFT_OUT, [asdict(item) for item in skipped])
+                _write(partial / LEFT_OUT, left_out)
         store = open_store(folder / "clips", self.hands)
-        rows = read_json_rows(folder / LEFT_OUT, {"clip_id": str, "reason": str})
-        reasons = {row["clip_id"]: row["reason"] for row in rows}
+        skipped = read_json_rows(folder / LEFT_OUT, {"clip_id": str, "reason": str})
+        reasons = {item["clip_id"]: item["reason"] for item in skipped}
         maps = read_target_contact(store.folder) | read_target_distances(store.folder)
         ids = [request.motion_id for request in requests]
         return [Skipped(name, reasons[name]) if name in reasons else store.clip(name) for name in ids], maps

@@ -211,6 +211,14 @@ def test_a_still_object_with_the_noise_of_recordings_does_not_move_as_corrected_
     assert bimart.moves(shaken(ball(), [6e-4, -6e-4])).tolist() == [True, True, False]
 
 
+def test_the_released_contact_counts_frames_in_which_a_vertex_moves_by_more_than_a_hundredth_of_a_millimetre(pair_of):
+    clip = under_the_hand(ball(), np.full(4, 0.003), RADIUS_M)
+    position_m = clip.object.translation_m.copy()
+    position_m[:, 0] = np.float32(position_m[0, 0]) + np.float32([0, 1.5e-5, 2.2e-5, 4e-5])
+    moved = replace(clip, object=replace(clip.object, translation_m=position_m))
+    assert bimart.con_paper(pair_of(moved, moved), 1).tolist() == [100, 100]  # the second step is 7 um
+
+
 def test_a_hinge_that_trembles_as_in_recordings_does_not_turn_and_one_that_turns_moves_the_object():
     tremble = np.float32([0, 0.0015, 0, 0.0019, 0.005])
     track = shaken(notebook(), np.zeros(4), tremble)

@@ -152,6 +152,33 @@ def test_samples_follow_the_objects_motion_and_do_not_depend_on_recorded_hands(
         assert [bool(first.hands[side].valid.all()) for side in SIDES] == sample.active_hands.tolist()
 
 
+def test_refinement_and_shape_follow_the_preset_unless_they_are_set(sources: Sources) -> None:
+    def loaded(**section: Any) -> tuple[str, bool]:
+        sampler = BimArtSampler.load(replace(sources, settings={"bimart": section}))
+        return sampler.refinement, sampler.fits_shape
+
+    assert loaded() == ("ours", True)
+    assert loaded(preset="paper") == ("paper", True)
+    assert loaded(preset="paper", refinement="none", shape="given") == ("none", False)
+    assert UNREFINED.load(sources).refinement == "none"  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(BadInput, match="refined is now refinement"):
+        loaded(refined=False)
+
+
+def test_the_given_shape_is_kept_and_a_fitted_one_is_that_of_the_keypoints(
+    sources: Sources, samples: list[ClipSample]
+) -> None:
+    request = replace(requests_for(samples[1], PredictionConfig(samples=1))[0], betas=np.full((2, 10), 0.5, np.float32))
+    sampler = BimArtSampler.load(sources, "none")
+    (motion,) = sampler.sample_motions([request])
+    side = SIDES[int(np.flatnonzero(request.active_hands)[0])]
+    given = replace(sampler, fits_shape=False).clip(request, motion).hands[side]
+    np.testing.assert_array_equal(given.betas, np.full((1, 10), 0.5, np.float32))
+    fitted = sampler.clip(request, motion).hands[side]
+    other = sampler.clip(replace(request, betas=np.zeros((2, 10), np.float32)), motion).hands[side]
+    np.testing.assert_array_equal(fitted.betas, other.betas)
+
+
 def test_a_request_without_object_motion_is_skipped_with_the_reason(
     sources: Sources, samples: list[ClipSample]
 ) -> None:

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from hoidata.batches.requests import ObjectPoints, Request
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.geometry.transform import RigidTransform
 from hoidata.sensors.part_bps import BasisSettings
 from hoidata.settings import build_config
+from models.bimart.family import keypoints_in_world
 from models.bimart.network import (
     ContactModel,
     DenoiserConfig,
@@ -105,9 +108,37 @@ def test_a_step_in_metres_moves_keypoints_towards_the_target_and_keeps_those_tha
     keypoints = torch.tensor([[[0.05, 0, 0], [0.0, 0.3, 0]]]).expand(1, 1, 2, 2, 3)
     target = ContactTarget(points_m, torch.tensor([[[0.0, 0.05]]]), torch.ones(1, 1, 2, dtype=torch.bool))
     step = metre_step(keypoints, target)
-    assert -0.05 <= float(step[0, 0, 0, 0, 0]) < -0.03
+    # One point of weight 1: the whole error over 1 + 0.5.
+    assert float(step[0, 0, 0, 0, 0]) == pytest.approx(-0.05 / 1.5)
     assert not step[0, 0, 0, 1].any()
     torch.testing.assert_close(step[0, 0, 1], torch.zeros(2, 3), atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize("target_m", [0.0, 0.01, 0.04])
+def test_a_point_with_a_large_target_distance_has_little_weight(target_m: float) -> None:
+    """Weights decay by 1/e in 2 cm of the target distance."""
+    keypoints = torch.tensor([[[0.05, 0, 0]]]).expand(1, 1, 2, 1, 3)
+    target = ContactTarget(torch.zeros(1, 1, 1, 3), torch.full((1, 1, 2), target_m), torch.ones(1, 1, 2).bool())
+    weight = np.exp(-target_m / 0.02)
+    expected = -weight * (0.05 - target_m) / (weight + 0.5)
+    assert metre_step(keypoints, target)[0, 0, :, 0, 0].numpy() == pytest.approx([expected, expected], rel=1e-4)
+
+
+def test_a_hand_is_active_within_20_cm_of_the_object() -> None:
+    distance_m = np.array([0.01, 0.19, 0.21, 0.5])
+    to_object = np.zeros((2, 4, 3, 3))
+    to_object[..., 2], to_object[:, :, 0, 2] = 1.0, distance_m
+    request = request_of(np.array([False, True]))
+    pose = RigidTransform(np.tile(np.eye(3), (4, 1, 1)), np.ones((4, 3)))
+    hands = keypoints_in_world(request, pose, np.zeros((2, 4, 3, 3)), to_object)
+    assert list(hands) == ["right"]
+    assert hands["right"].is_active.tolist() == [True, True, False, False]
+    np.testing.assert_array_equal(hands["right"].keypoints_m, np.ones((4, 3, 3)))
+
+
+def request_of(active_hands: np.ndarray) -> Request:
+    points = ObjectPoints(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1))
+    return Request("m", BOX, points, np.zeros(512, np.float32), active_hands, 4)
 
 
 def test_classifier_free_guidance_is_the_usual_formula_or_equation_7() -> None:
