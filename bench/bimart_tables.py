@@ -181,11 +181,14 @@ class Run:
 
 
 def rows(run: Run, names: Sequence[str], columns: Sequence[str]) -> list[list[str]]:
-    """The table: per method its title, motions, measured and all clips, seconds per motion, and a cell per metric."""
+    """The table: per method its title, motions, measured of all clips, seconds per motion, and a cell per metric."""
     table = []
     for name in names:
         result = run.evaluate(name)
-        counts = f"{result['motions']} of {result['held_out_clips']}" if "motions" in result else str(result["empty"])
+        counts = str(result.get("empty"))
+        if "motions" in result:
+            clips = result["counts"]["joint_error_mm"]["clips"]
+            counts = f"{result['motions']} in {clips} of {result['held_out_clips']}"
         seconds = " + ".join(_cell(value) for value in result.get("seconds", [None]))
         table.append([METHODS[name].title, counts, seconds, *(_metric(result, metric) for metric in columns)])
     return table
@@ -221,7 +224,7 @@ def main() -> None:
     )
     names = variables["METHODS"].split(",") if variables["METHODS"] else list(METHODS)
     for definition, columns in TABLES.items():
-        titles = ["method", "motions of clips", "s per motion: sample + measure", *columns]
+        titles = ["method", "motions in clips", "s per motion: sample + measure", *columns]
         table = [titles, ["---"] * len(titles), *rows(run, names, list(columns.values()))]
         print(f"\n{size} networks, {definition}, 95 % intervals over sequences\n")
         print("\n".join(f"| {' | '.join(cells)} |" for cells in table), flush=True)
