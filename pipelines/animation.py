@@ -123,7 +123,9 @@ def animate_files(
     """Animate a stored clip (its id) or a file of trajectories (its path), and write the result into ``out``."""
     animation = animate(source, options, profile, datasets)
     clip, hands, ghosts = animation.clip, animation.hands, animation.ghosts
-    sides: list[Side] = [side for side, made in zip(SIDES, animation.generated, strict=True) if made.any()]
+    sides: list[Side] = [
+        side for side, is_generated in zip(SIDES, animation.generated, strict=True) if is_generated.any()
+    ]
     checks = verdict(clip, hands, sides=sides)
     length = ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s")
     paths = write_motions(

@@ -1,4 +1,4 @@
-"""Compares a generated motion with the training clips of its verb; and its visible faults, in words.
+"""Compares a generated motion with the training clips of its verb; which side of each object is up in them.
 
 A few measures describe how the object moves (``hoidata.actions``), how fast the fastest joint is and how much touching
 joints slip. No test clip and no trained evaluator is involved.
@@ -13,6 +13,7 @@ from hoidata.batches.requests import ObjectPoints
 from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack
 from hoidata.clips.slip import joint_slips_cm_s, touched_parts
 from hoidata.contact.proximity import ProximityIndex
+from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, track_joints
 from hoidata.refinement import carried_fraction
 from hoidata.store.annotated import AnnotatedStore
@@ -105,3 +106,24 @@ def fastest_joint(joints_m: np.ndarray, valid: np.ndarray) -> float:
     """Speed in m/s of the fastest joint (F, 21, 3) between two frames that are ``valid`` (F,)."""
     steps = np.linalg.norm(np.diff(joints_m.astype(np.float64), axis=0), axis=2)[valid[1:] & valid[:-1]]
     return float(steps.max(initial=0.0)) * FPS
+
+
+def object_ups(store: AnnotatedStore) -> dict[str, list[float]]:
+    """(3,) direction that is up in the first frame, object frame, by object: the mean of its training clips."""
+    ups: dict[str, list[np.ndarray]] = {}
+    for clip_id in store.ids("train"):
+        clip = store.store.clip(clip_id, motion_only=True)
+        if clip.gravity is not None:
+            ups.setdefault(clip.object.model.name, []).append(up_in_object(clip.object, clip.gravity))
+    means = {name: np.mean(directions, axis=0) for name, directions in sorted(ups.items())}
+    # Objects that start in any pose have no side that is up.
+    return {
+        name: np.round(mean / length, 4).tolist()
+        for name, mean in means.items()
+        if (length := np.linalg.norm(mean)) > 0.5
+    }
+
+
+def up_in_object(track: ObjectTrack, gravity: np.ndarray) -> np.ndarray:
+    """(3,) direction of the object that is up in the first frame, object frame."""
+    return rotvec_to_rotmat(track.rotvec[0].astype(np.float64)).T @ -np.asarray(gravity, np.float64)

@@ -4,7 +4,7 @@ The hands touch the object, carry it, and do not pierce it. The object stands up
 shows the verb. A check that cannot be measured states the reason.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,14 +12,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hoidata.actions.action import Actions
-from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack, Side
-from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.batches.requests import ObjectPoints
+from hoidata.clips.clip import FPS, SIDES, Clip, Side
 from hoidata.hands import HandPair, track_joints
 from hoidata.metrics.unmeasured import NO_GRAVITY, Unmeasured
-from hoidata.metrics.verb_ranges import VerbRanges
+from hoidata.metrics.verb_ranges import VerbRanges, up_in_object
 from hoidata.objects.rays import EITHER, first_hits
 from hoidata.objects.surface_index import PartSurface, SurfaceIndex, surface_index
-from hoidata.store.annotated import AnnotatedStore
 from hoidata.surface.contact import HandInObjectFrame, deepest_m, hand_in_object_frame
 
 GAP_M = 0.01  # between skin and surface: a larger gap is visible
@@ -62,6 +61,22 @@ class RequestedVerb:
     numbers: Mapping[str, float]  # ``VerbRanges.numbers`` of the motion
 
 
+def requested_verb(
+    verb: str | None, known: Collection[str], ranges: VerbRanges | None, clip: Clip, points: ObjectPoints
+) -> RequestedVerb | Unmeasured:
+    """The verb that a motion must show, or why it cannot be checked.
+
+    Args:
+        known: the verbs of the training clips.
+        ranges: of the training clips; None if the checkpoint has none.
+    """
+    if ranges is None:
+        return Unmeasured("the checkpoint has no ranges of its training clips")
+    if verb is None or verb not in known:
+        return Unmeasured("the sentence has no verb of the training clips")
+    return RequestedVerb(verb, ranges, ranges.numbers(clip, points))
+
+
 def verdict(
     clip: Clip,
     hands: HandPair,
@@ -101,27 +116,6 @@ def summary(checks: Sequence[Check]) -> str:
 def verdict_lines(number: int, checks: Sequence[Check]) -> list[str]:
     """The verdict on one sample, for the terminal."""
     return [f"sample {number + 1}: {summary(checks)}", *(f"  {one.result}: {one.name}: {one.words}" for one in checks)]
-
-
-def object_ups(store: AnnotatedStore) -> dict[str, list[float]]:
-    """(3,) direction that is up in the first frame, object frame, by object: the mean of its training clips."""
-    ups: dict[str, list[np.ndarray]] = {}
-    for clip_id in store.ids("train"):
-        clip = store.store.clip(clip_id, motion_only=True)
-        if clip.gravity is not None:
-            ups.setdefault(clip.object.model.name, []).append(_up_in_object(clip.object, clip.gravity))
-    means = {name: np.mean(directions, axis=0) for name, directions in sorted(ups.items())}
-    # Objects that start in any pose have no side that is up.
-    return {
-        name: np.round(mean / length, 4).tolist()
-        for name, mean in means.items()
-        if (length := np.linalg.norm(mean)) > 0.5
-    }
-
-
-def _up_in_object(track: ObjectTrack, gravity: np.ndarray) -> np.ndarray:
-    """(3,) direction of the object that is up in the first frame, object frame."""
-    return rotvec_to_rotmat(track.rotvec[0].astype(np.float64)).T @ -np.asarray(gravity, np.float64)
 
 
 def _gap_m(hand: HandInObjectFrame, index: SurfaceIndex) -> np.ndarray:
@@ -223,7 +217,7 @@ def _stands_upright(clip: Clip, up: np.ndarray | Unmeasured) -> Check:
         return Check(name, None, NO_GRAVITY.reason)
     if isinstance(up, Unmeasured):
         return Check(name, None, up.reason)
-    actual = _up_in_object(clip.object, clip.gravity)
+    actual = up_in_object(clip.object, clip.gravity)
     tilt_deg = float(np.degrees(np.arccos(np.clip(actual @ up, -1, 1))))
     words = f"{tilt_deg:.0f} degrees from upright in the first frame (at most {TILT_DEG:.0f})"
     if tilt_deg > TILT_DEG and _looks_alike(clip, up, actual):

@@ -39,7 +39,7 @@ def turned(model: ObjectModel, rotation: np.ndarray) -> ObjectModel:
 
 
 def turned_back(clip: Clip, model: ObjectModel, rotation: np.ndarray) -> Clip:
-    """The clip of an object that was ``turned``, with the object in its own frame."""
+    """The clip of an object that was ``turned``, with the object in the frame of its mesh."""
     rotvec = clip.object.rotvec
     if (rotation != np.eye(3)).any():
         rotvec = rotmat_to_rotvec(rotvec_to_rotmat(rotvec.astype(np.float64)) @ rotation).astype(np.float32)
@@ -62,7 +62,7 @@ def closed_as_stored(clip: Clip, hands: HandPair) -> Clip:
 
 
 def _nearest_part(clip: Clip, side: Side, hands: HandPair) -> int:
-    """The part of the object that is nearer to the joints of a hand, on average over all frames."""
+    """The part of the object that is closer to the joints of a hand, on average over all frames."""
     track = clip.object
     joints_m = track.world_from_object.inverse() @ track_joints(clip.hands[side], hands[side]).astype(np.float64)
 

@@ -22,13 +22,13 @@ from hoidata.clips.clip import FPS, SIDES, Clip, HandType
 from hoidata.errors import BadInput
 from hoidata.files import sha256_file
 from hoidata.hands import HandPair, load_embedded_hands
-from hoidata.metrics.verdict import UNKNOWN_UP, Check, verdict
+from hoidata.metrics.verdict import UNKNOWN_UP, Check, requested_verb, verdict
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import POINT_COUNT, SampledPoints, sample_points
 from models.common.checkpoints import FILE_NAME, refuse_other_inputs
 from models.common.family import motion_clip
 from models.common.object_frame import Z, closed_as_stored, training_from_z_up, turned, turned_back
-from models.common.training_ranges import object_ups, requested_verb, verb_ranges
+from models.common.training_ranges import object_ups, verb_ranges
 from models.text2hoi.length import SHORTEST_FRAMES
 from models.text2hoi.sampler import Answer, SamplingConfig, Text2Hoi
 
@@ -171,7 +171,8 @@ class Generator:
     def _verdict(self, clip: Clip, verb: str | None, cloud: SampledPoints, in_training: bool) -> tuple[Check, ...]:
         up = self.object_ups.get(clip.object.model.name) if in_training else Z
         points = ObjectPoints(cloud.points_m, cloud.normals, cloud.part)
-        requested = requested_verb(self.model.trained["diffusion"], self.hands, verb, clip, points)
+        ranges = verb_ranges(self.model.trained["diffusion"], self.hands)
+        requested = requested_verb(verb, self.vocabulary.verbs, ranges, clip, points)
         return verdict(clip, self.hands, UNKNOWN_UP if up is None else np.asarray(up), requested)
 
     def _hand(self, text: str, options: MotionOptions) -> HandChoice:

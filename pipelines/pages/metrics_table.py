@@ -365,7 +365,7 @@ def _chart(metric: AnyMetric, files: _Files) -> Chart | None:
 
 
 def best_families(metric: AnyMetric, column: Mapping[str, float]) -> list[str]:
-    """Families that no other beats in a metric; the recorded clips do not compete, and zero is no merit.
+    """Families that no other beats in a metric; the recorded clips do not compete, and zeros are not marked.
 
     A method that does not move has no jitter, and one that does not touch has no penetration.
     """

@@ -277,7 +277,9 @@ def test_an_unknown_word_is_refused_unless_forced(trained: Path, tmp_path: Path)
         return generate_files(request, tmp_path / "out").notes
 
     for text in ("Throw the ball with the left hand.", "Juggle a box with both hands."):
-        with pytest.raises(BadInput, match=r"a verb that the models were trained on \(lift, open, pass\), got '\w+'; "):
+        with pytest.raises(
+            BadInput, match=r"a verb that the models were trained on \(lift, open, pass\), got '\w+'; did"
+        ):
             notes(text)
         assert not (tmp_path / "out").exists()
     assert "'Lfit' is read as 'lift'" in notes("Lfit the box with the left hand.")
@@ -375,17 +377,19 @@ def test_a_generated_clip_is_finite_and_starts_with_the_object_at_the_origin(tra
 def test_own_meshes_get_the_axis_up_that_was_up_in_training(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A z-up mesh moves as the same mesh in the frame of training, whose up axis is y."""
     monkeypatch.setattr(Generator, "object_ups", {"a": [0.0, 1.0, 0.0], "b": [0.1, 0.99, 0.0], "c": [0.0, 0.0, 1.0]})
-    own, text, options = user_box(), "Lift a box with the left hand.", MotionOptions(frames=8)
-    y_up = replace(own, vertices_m=own.vertices_m[:, [0, 2, 1]] * [1, 1, -1])
-    given = generator(trained).generate(text, own, options)[0]
+    z_up, text, options = user_box(), "Lift a box with the left hand.", MotionOptions(frames=8)
+    y_up = replace(z_up, vertices_m=z_up.vertices_m[:, [0, 2, 1]] * [1, 1, -1])
+    generated = generator(trained).generate(text, z_up, options)[0]
     expected = generator(trained).generate(text, y_up, options, in_training=True)[0]
     world_m, expected_m = (
-        one.clip.object.points_in_world(one.clip.object.model.vertices_m, own.part) for one in (given, expected)
+        one.clip.object.points_in_world(one.clip.object.model.vertices_m, z_up.part) for one in (generated, expected)
     )
     np.testing.assert_allclose(world_m, expected_m, atol=1e-4)
-    np.testing.assert_allclose(given.clip.hands["left"].wrist_m, expected.clip.hands["left"].wrist_m, atol=1e-4)
-    np.testing.assert_allclose(given.points.points_m[:, [0, 2, 1]] * [1, 1, -1], expected.points.points_m, atol=1e-5)
-    assert given.clip.object.model is own
+    np.testing.assert_allclose(generated.clip.hands["left"].wrist_m, expected.clip.hands["left"].wrist_m, atol=1e-4)
+    np.testing.assert_allclose(
+        generated.points.points_m[:, [0, 2, 1]] * [1, 1, -1], expected.points.points_m, atol=1e-5
+    )
+    assert generated.clip.object.model is z_up
     assert next(check for check in expected.verdict if check.name == "stands upright").passed is None
 
 

@@ -11,13 +11,12 @@ from hoidata.actions.action import learn_actions
 from hoidata.batches.requests import ObjectPoints
 from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
 from hoidata.hands import load_embedded_hands, track_joints, track_vertices
-from hoidata.metrics.verb_ranges import VerbRanges
+from hoidata.metrics.verb_ranges import VerbRanges, object_ups
 from hoidata.metrics.verdict import (
     GIVEN_MOTION,
     UNKNOWN_UP,
     Check,
     RequestedVerb,
-    object_ups,
     summary,
     verdict,
     verdict_lines,
@@ -106,7 +105,7 @@ def test_an_object_that_stands_still_fails_if_the_verb_moves_it(ranges: VerbRang
     assert check.passed is False
     assert check.words == "'lift' moves its object, but no point of it moves farther than 0.0 cm (at least 1 cm)"
     assert checks_of(still, ranges, "touch")["does the verb"].passed is not False
-    # A tremble of 2 mm adds up to a path of centimetres, but is no motion.
+    # A tremble of 2 mm adds up to a path of centimetres, but nothing moves.
     track = still.object.translation_m + 0.002 * np.random.default_rng(0).choice([-1, 1], (FRAMES, 3))
     trembling = replace(still, object=replace(still.object, translation_m=track.astype(np.float32)))
     assert "no point of it moves farther" in checks_of(trembling, ranges)["does the verb"].words
@@ -169,7 +168,7 @@ def test_a_plate_pierced_by_fingers_is_reported(height_m: float, fingers: int) -
 
 
 def test_a_hand_on_a_box_edge_is_not_through_it() -> None:
-    """The check asks for surfaces on opposite sides: a finger across an edge crosses two at a right angle."""
+    """The check needs surfaces on opposite sides: a finger across an edge crosses two at a right angle."""
     clip = lift(0.012)
     assert "0 fingers through the object" in checks_of(clip)["does not pierce"].words
 

@@ -117,8 +117,8 @@ def test_the_last_word_of_one_training_object_names_it() -> None:
 
 def test_of_several_paraphrases_the_first_that_was_trained_is_used() -> None:
     for verbs, expected in ((("grab", "grasp"), "grasp"), (("grab", "lift"), "grab")):
-        known = Vocabulary({(verb, "mug", "left"): 1 for verb in verbs})
-        wording = understood_words("Hold the mug", known, lambda: load_encoder("hash"))
+        vocabulary = Vocabulary({(verb, "mug", "left"): 1 for verb in verbs})
+        wording = understood_words("Hold the mug", vocabulary, lambda: load_encoder("hash"))
         assert (wording.verb, wording.text) == (expected, f"{expected.capitalize()} the mug")
 
 

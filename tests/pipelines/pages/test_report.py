@@ -97,7 +97,7 @@ def test_the_summary_names_training_comparison_and_the_best_and_worst_example(sa
     assert "<td>contact on 2 synthetic clips</td>" in summary
     assert "ground-truth: not worse than retrieval in any metric (24 motions of 12 clips)" in summary
     assert "contact F1 1.00" in summary
-    assert summary.count('href="#grab-examples"') == 1  # one motion is no worst one
+    assert summary.count('href="#grab-examples"') == 1  # the only motion is the best
     assert "The README&#39;s results" in summary or "README's results" in summary
     assert "Best and worst of 1 generated motions" in text
 
