@@ -278,7 +278,7 @@ def test_an_unknown_word_is_refused_unless_forced(trained: Path, tmp_path: Path)
 
     for text in ("Throw the ball with the left hand.", "Juggle a box with both hands."):
         with pytest.raises(
-            BadInput, match=r"a verb that the models were trained on \(lift, open, pass\), got '\w+'; did"
+            BadInput, match=r"a verb that the models were trained on \(lift, open, pass\), got '\w+'; name"
         ):
             notes(text)
         assert not (tmp_path / "out").exists()
