@@ -34,7 +34,7 @@ from hoidata.errors import BadInput
 from hoidata.files import array_pieces, arrays, npy_header, numpy_files, pickle_check, restricted_pickle, torch_pickle
 from hoidata.hands import load_embedded_hands, mano, model
 from hoidata.object_paths import keyframes
-from hoidata.objects import glb, mesh, ply, stl, user_mesh
+from hoidata.objects import glb, mesh, ply, stl, urdf, user_mesh
 from hoidata.store import mapped, store
 from models.manipnet import trajectory_files
 from pipelines import params
@@ -55,6 +55,12 @@ OBJ = (
 PLY = (
     b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face 3\n"
     b"property list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 1 2\n3 0 1 3\n4 0 1 2 3\n"
+)
+URDF = (
+    b'<robot name="r"><link name="a"><visual><geometry><box size="1 1 1"/></geometry></visual></link><link name="b">'
+    b'<visual><origin xyz="0 0 1" rpy="0 0 1"/><geometry><cylinder radius="0.2" length="1"/></geometry></visual></link>'
+    b'<joint name="j" type="prismatic"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>'
+    b'<limit lower="-1" upper="1"/></joint></robot>'
 )
 SEGMENTS = b"id path action_label start_act end_act start_frame end_frame\n1 subject1/h1/0 8 56 92 0 640\n"
 TREE = b'[{"id": 0, "children": [{"id": 1, "objs": ["new-0"]}, {"id": 2, "objs": ["new-1"]}]}]'
@@ -251,14 +257,15 @@ def _meshes_and_tables() -> dict[str, Target]:
         return keyframes.keyframed_path(hinged, keyframes.parse_keyframes(data, "keys"), (0.0, 2.0))
 
     def meshes(suffix: str) -> Callable[[bytes, Path], Any]:
-        return on_disk(f"a.{suffix}", mesh.load_mesh if suffix in ("obj", "ply") else user_mesh.read_mesh_file)
+        return on_disk(f"a.{suffix}", mesh.load_mesh if suffix in ("obj", "ply", "stl") else user_mesh.read_mesh_file)
 
     return {
         "obj": Target(seed_files(OBJ), meshes("obj"), [mesh]),
         "ply-ascii": Target(seed_files(PLY), meshes("ply"), [mesh, ply]),
         "ply-binary": Target(seed_files(binary_ply), meshes("ply"), [mesh, ply]),
         "glb": Target(seed_files(box.export(file_type="glb")), meshes("glb"), [user_mesh, glb]),
-        "stl": Target(seed_files(ascii_stl, box.export(file_type="stl")), meshes("stl"), [user_mesh, stl]),
+        "stl": Target(seed_files(ascii_stl, box.export(file_type="stl")), meshes("stl"), [mesh, stl]),
+        "urdf": Target(seed_files(URDF), on_disk("a.urdf", user_mesh.read_user_object), [urdf]),
         "trajectories-csv": Target(seed_files(table), parse(trajectory_files.parse_csv, "a.csv"), [trajectory_files]),
         "trajectories-manipnet": Target(
             seed_files(manipnet_rows), parse(trajectory_files.parse_manipnet, "a.txt"), [trajectory_files]

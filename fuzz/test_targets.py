@@ -94,7 +94,7 @@ def test_a_short_run_of_fuzzing_finds_nothing(tmp_path):
 def test_every_parser_of_files_from_outside_is_a_target():
     assert set(all_targets()) == {
         "pickle-arrays", "pickle-mano", "pickle-torch", "mano-file", "npy", "npy-object", "npz-object", "npz-pieces",
-        "npz-read", "npz-map", "obj", "ply-ascii", "ply-binary", "glb", "stl", "bvh", "gzip-text", "h2o-rows",
+        "npz-read", "npz-map", "obj", "ply-ascii", "ply-binary", "glb", "stl", "urdf", "bvh", "gzip-text", "h2o-rows",
         "h2o-segments", "arctic-descriptions", "arctic-parts", "arctic-misc", "trajectories-csv",
         "trajectories-manipnet", "trajectories-npz", "hoi4d-camera", "hoi4d-hand", "hoi4d-json", "hot3d-hands",
         "hot3d-tables", "hot3d-tar", "hot3d-json", "oakink2-annotation", "oakink2-json", "object-keyframes",

@@ -1,7 +1,9 @@
-"""`hoidata animate`: finger motion for a file of trajectories, or for frames of a stored clip (ManipNet)."""
+"""`hoidata animate` and `stream`: finger motion for trajectories, or for frames of a stored clip (ManipNet)."""
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from os.path import isfile  # returns False for a name that is too long, where Path.is_file raises
 from pathlib import Path
 from typing import Any, Literal
@@ -12,9 +14,10 @@ import torch
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, Side
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
+from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.metrics.verdict import summary, verdict, verdict_lines
 from hoidata.objects.model import ObjectModel
-from hoidata.objects.user_mesh import read_user_object
+from hoidata.objects.user_mesh import is_object_path, read_user_object
 from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import load_checkpoint
 from models.common.repeatable import make_repeatable
@@ -29,12 +32,22 @@ from models.manipnet.animate import (
     predict_fingers,
     with_fingers,
 )
-from models.manipnet.control import control_from_clip, hands_of
+from models.manipnet.control import Control, control_from_clip, hands_of
 from models.manipnet.network import ManipNet
 from models.manipnet.rollout import Predictor, Rule
+from models.manipnet.stream import Stream, tracked_frames
 from models.manipnet.training import MANIPNET
 from models.manipnet.trajectory_files import ENDINGS, Axes, TrajectoryFile, read_trajectories
-from pipelines.command_inputs import MeshOptions, ProjectData, WrittenFiles, stored_object, trained_on, trained_run
+from pipelines.command_inputs import (
+    MeshOptions,
+    ProjectData,
+    WrittenFiles,
+    check_new_store,
+    stored_object,
+    trained_on,
+    trained_run,
+    write_motion_store,
+)
 from pipelines.pages.motion_files import ARRAYS as SHARED
 from pipelines.pages.motion_files import MotionFiles, hand_shapes, motion_arrays, simplified_for_page, write_motions
 from pipelines.pages.player import motion_player
@@ -86,6 +99,11 @@ class AnimationOptions:
             raise BadInput("--world-up", "x, y or z", self.up, "name the axis of the file's world that points up")
 
 
+ShowPoses = Callable[[float, Mapping[Side, np.ndarray]], None]  # seconds, (15, 3, 3) rotations by side
+# Predictor, hands to animate, trajectories of the file and at 30 fps; gives (frame, 15, 3, 3) by side at 30 fps.
+PredictFingers = Callable[[Predictor, Mapping[Side, TrackedHand], Control, Control], dict[Side, np.ndarray]]
+
+
 @dataclass(frozen=True, eq=False)
 class Network:
     """A trained network that predicts finger poses."""
@@ -115,13 +133,47 @@ class Animation:
     hands: HandPair
     facts: list[tuple[str, str]]
     notes: list[str]
+    network_facts: Mapping[str, Any] = field(default_factory=dict)  # empty if the fingers are interpolated
+    source_info: Mapping[str, Any] = field(default_factory=dict)  # of the store of an animated clip
 
 
 def animate_files(
-    source: str, options: AnimationOptions, profile: str, datasets: tuple[str, ...], out: Path
+    source: str,
+    options: AnimationOptions,
+    profile: str,
+    datasets: tuple[str, ...],
+    out: Path,
+    store: Path | None = None,
 ) -> WrittenFiles:
-    """Animate a stored clip (its id) or a file of trajectories (its path), and write the result into ``out``."""
-    animation = animate(source, options, profile, datasets)
+    """Animate a stored clip (its id) or a file of trajectories (its path); write ``out``, and the clip to ``store``."""
+    check_new_store(store)
+    return _written(animate(source, options, profile, datasets), out, store)
+
+
+def stream_files(
+    source: str,
+    options: AnimationOptions,
+    profile: str,
+    datasets: tuple[str, ...],
+    out: Path,
+    store: Path | None,
+    show: ShowPoses,
+    in_real_time: bool = True,
+) -> WrittenFiles:
+    """Play a file of trajectories through a live ``Stream``, and write its poses as ``animate_files`` does.
+
+    Args:
+        show: called with each predicted pose, without delay.
+        in_real_time: push each frame at its recorded time; else without waiting.
+    """
+    check_new_store(store)
+    make_repeatable(threads=1)
+    project = ProjectData(profile, datasets, load_hands(profile))
+    predict = partial(_stream_fingers, show=show, in_real_time=in_real_time)
+    return _written(_from_file(Path(source), options, project, predict), out, store)
+
+
+def _written(animation: Animation, out: Path, store: Path | None) -> WrittenFiles:
     clip, hands, ghosts = animation.clip, animation.hands, animation.ghosts
     sides: list[Side] = [
         side for side, is_generated in zip(SIDES, animation.generated, strict=True) if is_generated.any()
@@ -141,6 +193,9 @@ def animate_files(
         facts=[*animation.facts, length, ("hand model", hands.name)],
         verdicts=[("", summary(checks), checks)],
     )
+    info = animation.source_info
+    stored = replace(clip, clip_id=f"{clip.clip_id}~0") if info else clip
+    paths += write_motion_store(store, [stored], hands, animation.network_facts, **info)
     return WrittenFiles(paths, animation.notes, verdict_lines(0, checks))
 
 
@@ -156,7 +211,8 @@ def animate(source: str, options: AnimationOptions, profile: str, datasets: tupl
 def _from_clip(clip_id: str, options: AnimationOptions, project: ProjectData) -> Animation:
     options.check_for_clip()
     hands, paths = project.hands, _clip_paths(clip_id, project)
-    clip = load_annotated(paths.data, hands).clip(clip_id)
+    annotated = load_annotated(paths.data, hands)
+    clip = annotated.clip(clip_id)
     frames = _frames(options.frames, clip.n_frames)
     sides: list[Side] = [side for side in SIDES if side in options.sides and clip.hands[side].valid.any()]
     if not sides:
@@ -187,7 +243,8 @@ def _from_clip(clip_id: str, options: AnimationOptions, project: ProjectData) ->
     is_synthetic = clip.synthetic or (network is not None and network.is_synthetic)
     ghosts: dict[Side, HandTrack] = {side: clip.hands[side] for side in sides}
     animated = replace(clip, hands=tracks, synthetic=is_synthetic)
-    return Animation(animated, generated, ghosts, hands, facts=rows, notes=notes)
+    network_facts = network.facts if network else {}
+    return Animation(animated, generated, ghosts, hands, rows, notes, network_facts, annotated.info)
 
 
 def _clip_paths(clip_id: str, project: ProjectData) -> StagePaths:
@@ -229,7 +286,41 @@ def _lost_notes(side: Side, track: HandTrack, frames: slice) -> list[str]:
     ]
 
 
-def _from_file(path: Path, options: AnimationOptions, project: ProjectData) -> Animation:
+def _predict_all(
+    predictor: Predictor, hands: Mapping[Side, TrackedHand], tracked: Control, control: Control
+) -> dict[Side, np.ndarray]:
+    gap = Gap(0, len(control.object_motion.time_s), None, None)
+    return {side: predict_fingers(predictor, hand, side, control, gap) for side, hand in hands.items()}
+
+
+def _stream_fingers(
+    predictor: Predictor,
+    hands: Mapping[Side, TrackedHand],
+    tracked: Control,
+    control: Control,
+    show: ShowPoses,
+    in_real_time: bool,
+) -> dict[Side, np.ndarray]:
+    models: dict[Side, ObjectModel] = dict.fromkeys(hands, control.model)
+    start: dict[Side, np.ndarray] = {side: hand.rest_rotmats for side, hand in hands.items()}
+    stream, shown = Stream(predictor, hands, models, start), list[Mapping[Side, np.ndarray]]()
+    step_s, first_s, started_s = predictor.settings.step_s, tracked.object_motion.time_s[0], time.monotonic()
+    for frame in tracked_frames(tracked):
+        if in_real_time:
+            time.sleep(max(frame.time_s - first_s - (time.monotonic() - started_s), 0))
+        for poses in stream.push(frame):
+            show(len(shown) * step_s, poses)
+            shown.append(poses)
+    for poses in stream.finish():
+        show(len(shown) * step_s, poses)
+        shown.append(poses)
+    numbers = np.round(np.arange(len(control.object_motion.time_s)) / FPS / step_s).astype(int).clip(0, len(shown) - 1)
+    return {side: np.stack([shown[number][side] for number in numbers]) for side in hands}
+
+
+def _from_file(
+    path: Path, options: AnimationOptions, project: ProjectData, predict: PredictFingers = _predict_all
+) -> Animation:
     options.check_for_file()
     trajectories = read_trajectories(path, options.unit, options.axes)
     network = chosen_network(options, project)
@@ -239,15 +330,16 @@ def _from_file(path: Path, options: AnimationOptions, project: ProjectData) -> A
     notes += [*given.notes, *_skipped_hand_notes(trajectories, given, options.sides)]
     control = at_30_fps(given.control)
     n_frames = len(control.object_motion.time_s)
-    generated, fingers = np.zeros((2, n_frames), bool), dict[Side, np.ndarray]()
-    for side in trajectories.wrists:
-        fingers[side] = np.tile(mean_hands[side].rest_rotmats, (n_frames, 1, 1, 1))
-        if side in given.active and side in options.sides:
-            gap = Gap(0, n_frames, None, None)
-            fingers[side] = predict_fingers(network.predictor, mean_hands[side], side, control, gap)
-            generated[SIDES.index(side)] = True
+    generated = np.zeros((2, n_frames), bool)
+    animated: dict[Side, TrackedHand] = {side: mean_hands[side] for side in given.active if side in options.sides}
+    fingers: dict[Side, np.ndarray] = {
+        side: np.tile(mean_hands[side].rest_rotmats, (n_frames, 1, 1, 1)) for side in trajectories.wrists
+    }
+    fingers |= predict(network.predictor, animated, given.control, control)
+    generated[[SIDES.index(side) for side in animated]] = True
     clip = clip_of(control, fingers, trajectories.up or UPS[options.up], path.stem, network.is_synthetic)
-    return Animation(clip, generated, {}, project.hands, facts=[*network.rows, ("object", model.name)], notes=notes)
+    rows = [*network.rows, ("object", model.name)]
+    return Animation(clip, generated, {}, project.hands, facts=rows, notes=notes, network_facts=network.facts)
 
 
 def _skipped_hand_notes(trajectories: TrajectoryFile, given: AnimationInput, sides: tuple[Side, ...]) -> list[str]:
@@ -262,9 +354,9 @@ def _skipped_hand_notes(trajectories: TrajectoryFile, given: AnimationInput, sid
 
 def _object(options: AnimationOptions, unit: str, project: ProjectData) -> tuple[ObjectModel, list[str]]:
     """A mesh file in its stored axes, or an object of the dataset; and notes for the user."""
-    if isfile(options.object):
+    if is_object_path(options.object):
         # The trajectories give the mesh's orientation, so the mesh is not rotated upright.
-        user = read_user_object(Path(options.object), unit, "z", options.mesh.hinge)
+        user = read_user_object(Path(options.object), unit, "z", options.mesh.hinge, options.mesh.moving)
         return user.model, list(user.notes)
     if not options.object:
         raise BadInput("--object", "the mesh of the object (.obj, .ply, .stl, .glb)", "none", "name it")

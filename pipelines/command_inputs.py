@@ -1,16 +1,18 @@
 """Inputs and results that `hoidata generate`, `animate` and `hands` share: mesh options, objects, trained networks."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from hoidata.clips.clip import Clip, WorldFrame
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
-from hoidata.store.store import open_store
+from hoidata.store.info import generated_info
+from hoidata.store.store import open_store, write_store
 from models.common.checkpoints import FILE_NAME, read_info
 from pipelines.stages.base import StagePaths
 
@@ -30,6 +32,7 @@ class MeshOptions:
     unit: str = ""
     up: str = ""
     hinge: str = ""
+    moving: str = ""
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,39 @@ def object_name(name: str, names: Sequence[str]) -> str:
     equal = [one for one in names if plain[one] == plain[name]]
     fitting = equal or [one for one in names if plain[name] and plain[one].endswith(plain[name])]
     return fitting[0] if len(fitting) == 1 else name
+
+
+def check_new_store(folder: Path | None) -> None:
+    """Raise BadInput if ``--store`` names something that exists: no recorded store is ever replaced."""
+    if folder is not None and folder.exists():
+        raise BadInput(folder, "a path that does not exist for --store", "an existing file or folder", "choose another")
+
+
+def write_motion_store(
+    folder: Path | None, clips: Sequence[Clip], hands: HandPair, networks: Mapping[str, Any], **source: Any
+) -> list[Path]:
+    """Write the motions of a command as a clip store; return its path, or nothing for the folder None.
+
+    The licence is that of ``source``, else that of the networks: only networks of generated clips may be shared.
+
+    Args:
+        networks: the facts in the header of a checkpoint; empty without a network.
+        source: facts of the store of the clip that the motions replace; see ``hoidata.store.info.store_info``.
+    """
+    if folder is None:
+        return []
+    check_new_store(folder)
+    gravity = clips[0].gravity
+    note = "z up, metres" if gravity is not None and gravity[2] < -1 + 1e-6 else "the world of the input"
+    frame = WorldFrame("+z" if note.startswith("z") else None, "unknown" if gravity is None else "stated", note)
+    facts = {"frame": {"handedness": "right", **asdict(frame)}, "synthetic": clips[0].synthetic}
+    if networks and not networks["synthetic"]:
+        facts |= {"licence": f"that of {', '.join(networks['datasets'])}, training data", "may_be_shared": False}
+    source_facts = {name: source[name] for name in ("frame", "hand_convention", "dataset_version") if name in source}
+    if source and not source["may_be_shared"]:
+        source_facts |= {name: source[name] for name in ("licence", "licences", "may_be_shared") if name in source}
+    write_store(folder, clips, generated_info(clips[0].dataset, hands, **facts | source_facts))
+    return [folder]
 
 
 def nearest_name(name: str, names: Sequence[str]) -> str:

@@ -1,7 +1,7 @@
 """`hoidata generate`: motions for a sentence and an object, with the models that fit the sentence best."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from functools import reduce
 from operator import add
 from pathlib import Path
@@ -18,6 +18,7 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
 from hoidata.metrics.verdict import verdict_lines
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.urdf import find_urdf
 from hoidata.objects.user_mesh import piece_names, read_user_object
 from hoidata.settings import build_config
 from hoidata.store.store import open_store
@@ -25,7 +26,15 @@ from models.common.checkpoints import FILE_NAME, read_info
 from models.common.repeatable import make_repeatable
 from models.text2hoi.generation import Generator, MotionOptions
 from models.text2hoi.sampler import SamplingConfig
-from pipelines.command_inputs import MeshOptions, WrittenFiles, mesh_notes, object_name, stored_object
+from pipelines.command_inputs import (
+    MeshOptions,
+    WrittenFiles,
+    check_new_store,
+    mesh_notes,
+    object_name,
+    stored_object,
+    write_motion_store,
+)
 from pipelines.pages.generation_page import write_generation
 from pipelines.params import chosen_params, read_file
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
@@ -60,19 +69,20 @@ class GenerationRequest:
     force: bool = False  # generate even if the sentence has unknown words, and keep those words
 
 
-def generate_files(request: GenerationRequest, out: Path) -> WrittenFiles:
-    """Generate motions; write arrays, an animated GLB and a page with a player into ``out``.
+def generate_files(request: GenerationRequest, out: Path, store: Path | None = None) -> WrittenFiles:
+    """Generate motions; write arrays, an animated GLB and a page with a player into ``out``, and clips to ``store``.
 
     Raises:
         MissingResource: models or files are missing.
         BadInput: the sentence, the object or an option is not usable.
     """
+    check_new_store(store)
     read_sentence(request.text)  # refuses other text before anything is loaded
     request, notes = _with_object_name(request)
     user = None
     if isinstance(request.object, Path):
-        user = read_user_object(request.object, request.mesh.unit, request.mesh.up, request.mesh.hinge)
-        notes += [*user.notes, *mesh_notes(user.model)]
+        user = read_user_object(request.object, *astuple(request.mesh))
+        notes += [*user.notes, *mesh_notes(user.model), *_slide_notes(user.model)]
     wording = _wording(request)
     verb, noun = wording.verb, wording.noun
     models, reason = (request.models, "") if request.models else _project_models(request, verb, noun)
@@ -101,7 +111,10 @@ def generate_files(request: GenerationRequest, out: Path) -> WrittenFiles:
         notes += [f"never seen: {note}" for note in evidence["unseen"]]
     notes += _further_verb_notes(wording.text, verb, generator.vocabulary)
     verdicts = [line for motion in motions for line in verdict_lines(motion.evidence["number"], motion.verdict)]
-    return WrittenFiles(write_generation(out, motions, hands, str(models.checkpoints), notes), notes, verdicts)
+    paths = write_generation(out, motions, hands, str(models.checkpoints), notes)
+    clips = [replace(motion.clip, verb=evidence["verb"]) for motion in motions]
+    paths += write_motion_store(store, clips, hands, generator.model.facts)
+    return WrittenFiles(paths, notes, verdicts)
 
 
 def _preset_notes(checkpoints: Path, networks: Sequence[str]) -> list[str]:
@@ -125,12 +138,21 @@ def _missing_hinge_notes(verb: str | None, object: str | Path, model: ObjectMode
     problem = f"{verb!r} turns a hinge, but the object has none"
     if not isinstance(object, Path):
         return [f"{problem}: choose one that has"]
+    if find_urdf(object):
+        return [f"{problem}: its URDF has no movable joint"]
     pieces = piece_names(object)
     if pieces is None:
         return [f"{problem}: it needs a mesh of two objects or nodes, the second of which moves, and --hinge"]
     names = f" ({pieces[0]!r} and {pieces[1]!r})" if all(pieces) else ""
     option = '--hinge "px,py,pz dx,dy,dz", a point and the direction of the axis about which the second turns'
     return [f"{problem}: the mesh has two pieces{names}; add {option}"]
+
+
+def _slide_notes(model: ObjectModel) -> list[str]:
+    if model.hinge is None or not model.hinge.is_prismatic:
+        return []
+    slide = f"{100 * model.joint_scale:.0f} cm"
+    return [f"the networks were trained on hinges: one radian of a network slides this part by {slide}"]
 
 
 def _wording(request: GenerationRequest) -> Wording:

@@ -1,10 +1,9 @@
 """`hoidata hands`: hand motions for an object motion from keyframes, a clip or a generated motion (BimArt)."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from itertools import chain
-from os.path import isfile  # returns False for a name that is too long, where Path.is_file raises
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,13 +19,13 @@ from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.metrics.unmeasured import Unmeasured
 from hoidata.metrics.verdict import UNKNOWN_UP, verdict, verdict_lines
 from hoidata.object_paths import keyframed_path, read_keyframes
-from hoidata.object_paths.path import MAX_S, PathStep, check_pace
-from hoidata.objects.model import Hinge, ObjectModel
-from hoidata.objects.user_mesh import read_user_object
+from hoidata.object_paths.path import MAX_S, PathStep, check_pace, joint_range_words
+from hoidata.objects.model import ObjectModel
+from hoidata.objects.user_mesh import is_object_path, read_user_object
 from hoidata.store.annotated import load_annotated
-from hoidata.store.store import Store, open_store
+from hoidata.store.store import Store, open_store, stored_hinge
 from models.bimart.family import BIMART, BimArtSampler
-from models.bimart.hands import HandSamplingOptions, hands_for
+from models.bimart.hands import HandSamplingOptions, SampledHands, hands_for
 from models.common.checkpoints import FILE_NAME, read_info
 from models.common.family import Sources
 from models.common.repeatable import make_repeatable
@@ -35,10 +34,12 @@ from pipelines.command_inputs import (
     ProjectData,
     WrittenFiles,
     check_dataset,
+    check_new_store,
     mesh_notes,
     nearest_name,
     trained_on,
     trained_run,
+    write_motion_store,
 )
 from pipelines.pages.hands_page import write_hands
 from pipelines.pages.motion_files import hand_shapes
@@ -46,6 +47,7 @@ from pipelines.show_pages import dataset_of_clip
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
 
 MIN_LENGTH_S = 0.3
+NEAR_M, MOVING_RAD, MAX_UNTOUCHED = 0.02, 0.002, 0.5  # a joint that moves by itself is reported
 MAX_FRAMES = round(MAX_S * FPS) + 1
 MAX_CLIPS_FOR_RANGE = 60  # recorded clips of an object from which its range of hinge angles is read
 GENERATED_ARRAYS = ("object_rotvec", "object_translation_m", "object_vertices_m", "object_faces", "object_part")
@@ -77,29 +79,42 @@ class ObjectMotion(NamedTuple):
     source: str  # in words
     notes: list[str]
     up: np.ndarray | Unmeasured = UNKNOWN_UP  # (3,) direction of the object that is up when it stands, object frame
+    verb: str | None = None  # of a stored clip
 
 
-def hands_files(options: HandsOptions, profile: str, datasets: tuple[str, ...], out: Path) -> WrittenFiles:
+def hands_files(
+    options: HandsOptions, profile: str, datasets: tuple[str, ...], out: Path, store: Path | None = None
+) -> WrittenFiles:
     """Generate hands; write arrays, an animated GLB per sample and a page with a player into ``out``.
+
+    With ``store``, the motions also become a store of clips; those for a stored clip are named <clip>~<sample>.
 
     Raises:
         MissingResource: networks or files are missing.
         BadInput: the object, its motion or an option is not usable.
     """
     make_repeatable(threads=1)
+    check_new_store(store)
     project = ProjectData(profile, datasets, load_hands(profile))
     motion = object_motion(options, project)
     paths, sampler = chosen_networks(options.model, project)
     samples = hands_for(sampler, motion.track, motion.wish)
     files = [paths.checkpoints / name / FILE_NAME for name in BIMART.uses]
     digests = {str(path): sha256_file(path) for path in files}
-    training_data = trained_on(read_info(paths.checkpoints / BIMART.uses[-1] / FILE_NAME)["facts"])
-    facts = [("object's motion", motion.source), ("networks", f"{paths.checkpoints} (trained on {training_data})")]
-    notes = [*motion.notes, *mesh_notes(motion.track.model)]
+    networks = read_info(paths.checkpoints / BIMART.uses[-1] / FILE_NAME)["facts"]
+    training_data = f"{paths.checkpoints} (trained on {trained_on(networks)})"
+    facts = [("object's motion", motion.source), ("networks", training_data)]
+    notes = [*motion.notes, *_notes(samples)]
     checks = [verdict(sample.clip, project.hands, motion.up) for sample in samples]
-    paths = write_hands(out, samples, project.hands, motion.steps, digests, facts, checks, notes)
+    written = write_hands(out, samples, project.hands, motion.steps, digests, facts, checks, notes)
+    clips, info = [sample.clip for sample in samples], dict[str, Any]()
+    if options.clip:
+        info = open_store(dataset_of_clip(options.clip, profile, list(datasets)).clips, project.hands).info
+        names = {"dataset": info["dataset"], "verb": motion.verb}
+        clips = [replace(clip, clip_id=f"{options.clip}~{number}", **names) for number, clip in enumerate(clips)]
+    written = [*written, *write_motion_store(store, clips, project.hands, networks, **info)]
     lines = [verdict_lines(sample.number, one) for sample, one in zip(samples, checks, strict=True)]
-    return WrittenFiles(paths, notes, list(chain.from_iterable(lines)))
+    return WrittenFiles(written, notes, list(chain.from_iterable(lines)))
 
 
 def object_motion(options: HandsOptions, project: ProjectData) -> ObjectMotion:
@@ -135,11 +150,30 @@ def chosen_networks(model: str, project: ProjectData) -> tuple[StagePaths, BimAr
     return paths, BimArtSampler.load(sources)
 
 
+def _notes(samples: list[SampledHands]) -> list[str]:
+    """Notes on the mesh (open, repaired), and on a moving part that no hand is near."""
+    notes = mesh_notes(samples[0].clip.object.model)
+    for sample in samples:
+        if (untouched := _untouched_fraction(sample)) > MAX_UNTOUCHED:
+            percent = f"{untouched:.0%} of the frames in which its joint moves"
+            notes.append(f"sample {sample.number + 1}: no hand is within 2 cm of the moving part in {percent}")
+    return notes
+
+
+def _untouched_fraction(sample: SampledHands) -> float:
+    """Of the frames with a moving joint, the fraction in which no hand is near the moving part; 0 if it rests."""
+    angle_rad = sample.clip.object.joint_angle_rad
+    if angle_rad is None or not (moves := np.abs(np.diff(angle_rad, prepend=angle_rad[:1])) > MOVING_RAD).any():
+        return 0.0
+    nearest_m = sample.reached_m[:, moves][..., sample.points.part == 1].min(axis=(0, 2), initial=np.inf)
+    return float((nearest_m > NEAR_M).mean())
+
+
 class _MovableObject(NamedTuple):
     """An object that keyframes move."""
 
     model: ObjectModel
-    hinge_limits_rad: tuple[float, float] | None  # lowest and highest angle
+    hinge_limits_rad: tuple[float, float] | None  # lowest and highest joint position
     rest_rotation: np.ndarray | None  # (3, 3) world_from_object as it stands on the table; None: as its mesh is stored
     notes: list[str]
 
@@ -147,18 +181,19 @@ class _MovableObject(NamedTuple):
 def _object(options: HandsOptions, project: ProjectData) -> _MovableObject:
     if not options.object:
         raise BadInput("object", "a mesh file (.obj, .ply, .stl, .glb) or a dataset's object", "none", "name it first")
-    limits_rad = hinge_range(options.hinge_range) if options.hinge_range else None
-    if isfile(options.object):
+    if is_object_path(options.object):
         mesh = options.mesh
-        user = read_user_object(Path(options.object), mesh.unit, mesh.up, mesh.hinge)
-        notes = list(user.notes)
-        if user.model.is_articulated and limits_rad is None:
-            notes.append("the range of the hinge is not known; --hinge-range 0:110 has it checked")
-        return _MovableObject(user.model, limits_rad, None, notes)
+        user = read_user_object(Path(options.object), *astuple(mesh))
+        notes, limits = list(user.notes), hinge_range(options.hinge_range, user.model) or user.joint_limits
+        if user.model.is_articulated and limits is None:
+            notes.append("the range of the joint is not known; --hinge-range 0:110 has it checked")
+        return _MovableObject(user.model, limits, None, notes)
     stores = _converted((options.model,) if options.model else project.datasets, project)
     for store in stores:
         if options.object in list(store.objects["object"]):
-            return _recorded_object(store, options.object, limits_rad)
+            return _recorded_object(
+                store, options.object, hinge_range(options.hinge_range, store.object_model(options.object))
+            )
     names = sorted({name for store in stores for name in store.objects["object"]})
     expected = "a mesh file (.obj, .ply, .stl, .glb)" + (f" or one of: {', '.join(names)}" if names else "")
     remedy = nearest_name(options.object, names) or ("correct the name or path" if names else "correct the path")
@@ -182,22 +217,30 @@ def _recorded_object(store: Store, name: str, limits_rad: tuple[float, float] | 
     angles = [clip.object.hinge_rad for clip in clips if clip.object.hinge_rad is not None]
     if angles and limits_rad is None:
         low, high = min(0.0, *(float(a.min()) for a in angles)), max(0.0, *(float(a.max()) for a in angles))
-        notes.append(f"recorded with its hinge at {np.degrees(low):.0f} to {np.degrees(high):.0f} deg")
+        hinge = store.object_model(name).hinge
+        slides = hinge is not None and hinge.is_prismatic
+        notes.append(f"recorded with its joint at {joint_range_words((low, high), slides)}")
         # Recordings show the direction in which a hinge opens, but not its stop, so half a turn is allowed.
-        limits_rad = (-np.pi, high) if -low > high else (low, np.pi)
+        if not slides:
+            limits_rad = (-np.pi, high) if -low > high else (low, np.pi)
     return _MovableObject(store.object_model(name), limits_rad, rest_rotation, notes)
 
 
-def hinge_range(text: str) -> tuple[float, float]:
-    """The lowest and highest hinge angle, radians, of a text in degrees such as "0:110"."""
+def hinge_range(text: str, model: ObjectModel) -> tuple[float, float] | None:
+    """The lowest and highest joint position of a text, in degrees or of a slide in cm, such as "0:110"; None for ""."""
+    if not text:
+        return None
+    slides = model.hinge is not None and model.hinge.is_prismatic
     try:
-        low_deg, high_deg = (float(word) for word in text.split(":"))
-        if not -360 <= low_deg <= 0 <= high_deg <= 360 or low_deg == high_deg:
+        low, high = (float(word) for word in text.split(":"))
+        if not -360 <= low <= 0 <= high <= 360 or low == high:
             raise ValueError
     except ValueError as error:
-        remedy = "write e.g. 0:110; 0 is the hinge angle of the mesh as stored"
-        raise BadInput("--hinge-range", "two angles in degrees that include 0", text[:40], remedy) from error
-    return float(np.radians(low_deg)), float(np.radians(high_deg))
+        remedy = "write e.g. 0:110; 0 is the joint position of the mesh as stored"
+        expected = f"two {'slides in cm' if slides else 'angles in degrees'} that include 0"
+        raise BadInput("--hinge-range", expected, text[:40], remedy) from error
+    unit = 0.01 if slides else float(np.radians(1.0))
+    return low * unit, high * unit
 
 
 def _keyframed_motion(options: HandsOptions, project: ProjectData, wish: HandSamplingOptions) -> ObjectMotion:
@@ -219,7 +262,7 @@ def _clip_motion(options: HandsOptions, project: ProjectData, wish: HandSampling
     notes = [] if clip.gravity is not None else ["up: z, assumed: the gravity of this clip is not known"]
     gravity = wish.gravity if clip.gravity is None else np.asarray(clip.gravity, np.float64)
     wish = replace(wish, words=clip.object_words, gravity=gravity, betas=betas, template_m=template_m)
-    return ObjectMotion(clip.object, wish, steps=(), source=f"clip {options.clip}", notes=notes)
+    return ObjectMotion(clip.object, wish, steps=(), source=f"clip {options.clip}", notes=notes, verb=clip.verb)
 
 
 def _generated_motion(options: HandsOptions, project: ProjectData, wish: HandSamplingOptions) -> ObjectMotion:
@@ -252,7 +295,7 @@ def _mesh_of(arrays: dict[str, np.ndarray], path: Path) -> ObjectModel:
     if "object_hinge_rad" in arrays:
         if "object_hinge_axis" not in arrays:
             raise BadInput(path, "an object_hinge_axis", "none", "name the object too, or generate the motion again")
-        hinge = Hinge(arrays["object_hinge_axis"], arrays["object_hinge_origin_m"])
+        hinge = stored_hinge(arrays["object_hinge_axis"], arrays.get("object_hinge_origin_m"))
     vertices, faces, part = (arrays[f"object_{name}"] for name in ("vertices_m", "faces", "part"))
     fits = vertices.shape == (len(part), 3) and faces.ndim == 2 and faces.shape[1] == 3 and faces.dtype.kind in "iu"
     if not fits or not len(faces) or not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):

@@ -178,6 +178,7 @@ class TestText2Hoi:
             template_m=None,
             hinge_axis=torch.zeros(1, 3),
             hinge_origin_m=torch.zeros(1, 3),
+            slide_m=torch.zeros(1, 3),
             articulated=torch.zeros(1, dtype=torch.bool),
         )
         condition = Condition(batch, batch.text, [None], torch.zeros(1, 2, 1024))

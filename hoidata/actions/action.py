@@ -124,8 +124,8 @@ def action_numbers(track: ObjectTrack, gravity: np.ndarray | None, touching: np.
         touching: (2, frame) bool, whether the left and the right hand touch the object.
     """
     degrees = np.zeros(track.n_frames)
-    if track.hinge_rad is not None:
-        degrees = np.degrees(track.hinge_rad - track.hinge_rad[0], dtype=np.float64)
+    if (angle_rad := track.joint_angle_rad) is not None:
+        degrees = np.degrees(angle_rad - angle_rad[0], dtype=np.float64)
     middle_m = object_middle_m(track)
     unknown = dict.fromkeys(MEASURES, float("nan"))
     return unknown | _upright(track, middle_m, gravity) | _touching(touching) | {

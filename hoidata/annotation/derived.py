@@ -107,11 +107,12 @@ def object_motion(clip: Clip, evidence: HandEvidence) -> ObjectMotion:
     travel_m = shift_m if up is None or height_m is None else shift_m - np.maximum(height_m, 0)[:, None] * up
     shakes, shaken = _shakes(centre_m)
     turned_rad = float(rotation_angle(rotation[0].T @ rotation).max())
-    hinge_range_rad = 0.0 if track.hinge_rad is None else float(np.ptp(track.hinge_rad))
+    angle_rad = track.joint_angle_rad
+    hinge_range_rad = 0.0 if angle_rad is None else float(np.ptp(angle_rad))
     is_still = np.ptp(centre_m, axis=0).max() < STILL_M and max(turned_rad, hinge_range_rad) < STILL_RAD
     touched = np.any([evidence.near(side) for side in SIDES], axis=0)
     return ObjectMotion(
-        hinge_rad=None if track.hinge_rad is None else track.hinge_rad.astype(np.float64),
+        hinge_rad=None if angle_rad is None else angle_rad.astype(np.float64),
         height_m=height_m,
         travelled_m=float(np.linalg.norm(travel_m, axis=1).max()),
         turned_rad=turned_rad,

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hoidata.devices import send
 from hoidata.errors import BadInput
-from hoidata.objects.model import ObjectModel
+from hoidata.objects.model import ObjectModel, joint_vectors
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,9 @@ class RequestBatch:
     sides: tuple[bool, bool]  # likewise: whether each hand is active in any request
     betas: Tensor  # (B, 2, 10)
     template_m: Tensor | None  # (B, 2, 778, 3)
-    hinge_axis: Tensor  # (B, 3), zero for rigid objects
+    hinge_axis: Tensor  # (B, 3), zero for rigid objects and prismatic joints
     hinge_origin_m: Tensor  # (B, 3), zero for rigid objects
+    slide_m: Tensor  # (B, 3) displacement per unit of the joint feature, zero without a prismatic joint
     articulated: Tensor  # (B,) bool
 
     def __len__(self) -> int:
@@ -115,6 +116,7 @@ def conditions(items: Sequence[Any], objects: Sequence[ObjectModel], lengths: np
         lengths: (B,) number of frames of each.
     """
     hinges = [model.hinge for model in objects]
+    joints = [joint_vectors(model) for model in objects]
     arrays = {
         "points_m": np.stack([item.points.points_m for item in items]),
         "normals": np.stack([item.points.normals for item in items]),
@@ -124,8 +126,9 @@ def conditions(items: Sequence[Any], objects: Sequence[ObjectModel], lengths: np
         "frames": np.arange(lengths.max()) < lengths[:, None],
         "lengths": lengths,
         "betas": np.stack([item.betas for item in items]),
-        "hinge_axis": np.stack([np.zeros(3) if h is None else h.axis for h in hinges]).astype(np.float32),
+        "hinge_axis": np.stack([axis for axis, _ in joints]).astype(np.float32),
         "hinge_origin_m": np.stack([np.zeros(3) if h is None else h.origin_m for h in hinges]).astype(np.float32),
+        "slide_m": np.stack([slide_m for _, slide_m in joints]).astype(np.float32),
         "articulated": np.array([hinge is not None for hinge in hinges]),
     }
     tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}

@@ -89,7 +89,13 @@ class ObjectTrack(Track):
     model: ObjectModel  # canonical mesh, parts and hinge
     rotvec: np.ndarray  # (frame, 3) axis-angle of ``world_from_object``, radians
     translation_m: np.ndarray  # (frame, 3) world position of the object frame's origin
-    hinge_rad: np.ndarray | None = None  # (frame,) unwrapped hinge angle; None for a rigid object
+    # (frame,) unwrapped hinge angle, or displacement of a prismatic joint in metres; None for a rigid object
+    hinge_rad: np.ndarray | None = None
+
+    @property
+    def joint_angle_rad(self) -> np.ndarray | None:
+        """(frame,) ``hinge_rad`` with the positions of a prismatic joint as angles (``ObjectModel.joint_scale``)."""
+        return self.hinge_rad if self.hinge_rad is None else self.hinge_rad / np.float32(self.model.joint_scale)
 
     @property
     def is_articulated(self) -> bool:

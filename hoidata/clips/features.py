@@ -3,7 +3,7 @@
 Text2HOI's layout (Cha et al. 2024, Sec. 3.2.1). Last axis; metres, radians, 6D rotations as in ``rotmat_to_rot6d``:
 
     hand (99):   WRIST 0:3 | GLOBAL_ORIENT_6D 3:9 | HAND_POSE_6D 9:99, the 15 finger joints, absolute
-    object (10): OBJECT_POSITION 0:3 | OBJECT_ROTATION_6D 3:9 | OBJECT_HINGE 9, 0 for rigid objects
+    object (10): OBJECT_POSITION 0:3 | OBJECT_ROTATION_6D 3:9 | OBJECT_HINGE 9, ``joint_angle_rad``, 0 for rigid objects
 
 ``HAND_ROTATIONS_6D`` has all 16 rotations of a hand, 6 numbers each, the global one first.
 """
@@ -46,7 +46,7 @@ def object_features(track: ObjectTrack, model_from_world: np.ndarray, origin_m: 
     """Return the features (frame, 10) float32 of one object in the model frame; arguments as in ``hand_features``."""
     rotation = model_from_world @ rotvec_to_rotmat(track.rotvec.astype(np.float64))
     position = (track.translation_m - origin_m) @ model_from_world.T
-    hinge = np.zeros(len(position)) if track.hinge_rad is None else track.hinge_rad
+    hinge = np.zeros(len(position)) if track.joint_angle_rad is None else track.joint_angle_rad
     return np.concatenate((position, rotmat_to_rot6d(rotation), hinge[:, None]), axis=1, dtype=np.float32)
 
 

@@ -123,9 +123,9 @@ def steps_m(track: ObjectTrack) -> np.ndarray:
 
 def turns_rad(track: ObjectTrack) -> np.ndarray:
     """(frame,) absolute change of the hinge angle to the next frame, radians; 0 in the last frame."""
-    if track.hinge_rad is None:
+    if (angle_rad := track.joint_angle_rad) is None:
         return np.zeros(track.n_frames)
-    return np.append(np.abs(np.diff(track.hinge_rad.astype(np.float64))), 0.0)
+    return np.append(np.abs(np.diff(angle_rad.astype(np.float64))), 0.0)
 
 
 def moves(track: ObjectTrack) -> np.ndarray:

@@ -137,8 +137,8 @@ def _object(clip: Clip, touched: Mapping[Side, np.ndarray]) -> Iterator[tuple[st
         up = -np.asarray(clip.gravity, np.float64)
         up_in_object = rotation[0].T @ up
         yield "object tilt", float(np.degrees(np.arccos(np.clip(rotation @ up_in_object @ up, -1, 1)).max()))
-    if clip.object.hinge_rad is not None:
-        hinge_rad_s = np.abs(np.diff(clip.object.hinge_rad.astype(np.float64))) * FPS
+    if (angle_rad := clip.object.joint_angle_rad) is not None:
+        hinge_rad_s = np.abs(np.diff(angle_rad.astype(np.float64))) * FPS
         moves = hinge_rad_s > HINGE_MOVES_RAD_S
         if moves.any():
             yield "hinge speed", float(np.degrees(hinge_rad_s[moves].mean()))

@@ -6,6 +6,7 @@ CSV has one row per keyframe; JSON is a list of objects, or ``{"keyframes": [...
 - ``x_m y_m z_m`` (or ``_cm``, ``_mm``): translation from the start; z is the height above the table.
 - ``qw qx qy qz``, or an axis-angle ``rx_deg ry_deg rz_deg`` (or ``_rad``): rotation about the object's centre.
 - ``hinge_deg`` (or ``hinge_rad``): hinge angle; 0 is the angle of the mesh file.
+- ``slide_cm`` (or ``_m``, ``_mm``) instead: displacement of a drawer.
 
 Missing columns are zero. Rotations about a single axis may exceed half a turn: ``rz_deg`` 0, then 360 is a full turn.
 """
@@ -23,7 +24,16 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
-from hoidata.object_paths.path import MAX_S, ObjectPath, PathStep, check_mean_rate, checked_path, frame_times, smooth
+from hoidata.object_paths.path import (
+    MAX_S,
+    ObjectPath,
+    PathStep,
+    check_mean_rate,
+    checked_path,
+    frame_times,
+    joint_rate,
+    smooth,
+)
 from hoidata.objects.model import ObjectModel
 
 MAX_BYTES, MAX_KEYS = 2**20, 5000
@@ -31,7 +41,9 @@ MAX_BYTES, MAX_KEYS = 2**20, 5000
 MAX_ROTATION_RAD = np.radians(170)
 SAME_AXIS_RAD = 1e-6
 _FACTORS = {"s": 1.0, "ms": 1e-3, "m": 1.0, "cm": 0.01, "mm": 0.001, "rad": 1.0, "deg": float(np.pi / 180)}
-_UNITS = {name: ("m", "cm", "mm") for name in "xyz"} | {name: ("deg", "rad") for name in ("rx", "ry", "rz", "hinge")}
+_UNITS = {name: ("m", "cm", "mm") for name in (*"xyz", "slide")} | {
+    name: ("deg", "rad") for name in ("rx", "ry", "rz", "hinge")
+}
 _COLUMNS = {f"{name}_{unit}": (name, _FACTORS[unit]) for name, units in _UNITS.items() for unit in units} | {
     "time_s": ("time", 1.0),
     "time_ms": ("time", 1e-3),
@@ -46,8 +58,9 @@ class Keyframes:
     time_s: np.ndarray  # (key,) ascending from 0
     shift_m: np.ndarray  # (key, 3)
     rotmats: np.ndarray  # (key, 3, 3)
-    hinge_rad: np.ndarray | None  # (key,), None without a hinge column
+    hinge_rad: np.ndarray | None  # (key,), metres of a slide; None without a column for the joint
     rotvec_rad: np.ndarray | None = None  # (key, 3) axis-angles of any length, None for quaternions
+    is_slide: bool = False  # whether ``hinge_rad`` is a slide
 
 
 def read_keyframes(path: str | Path) -> Keyframes:
@@ -84,16 +97,15 @@ def keyframed_path(
     Args:
         model: the object.
         keys: the keyframes.
-        limits_rad: smallest and largest hinge angle, if known.
+        limits_rad: smallest and largest joint position, radians or metres, if known.
         source: where the keyframes are from, for messages.
         standing: as in ``checked_path``.
 
     Raises:
-        BadInput: a rigid object with hinge angles, an ambiguous rotation, or a path that ``checked_path`` refuses.
+        BadInput: joint positions that do not fit the object's joint, an ambiguous rotation, or a path that
+            ``checked_path`` refuses.
     """
-    if keys.hinge_rad is not None and keys.hinge_rad.any() and not model.is_articulated:
-        remedy = 'give the hinge (--hinge "px,py,pz dx,dy,dz"), or remove the column'
-        raise BadInput(source, f"no hinge angle: {model.name!r} is rigid", "a column hinge_...", remedy)
+    _check_joint(model, keys, source)
     steps = [
         PathStep(f"keyframes {number + 1} to {number + 2}", float(start), float(end))
         for number, (start, end) in enumerate(zip(keys.time_s[:-1], keys.time_s[1:], strict=True))
@@ -105,11 +117,24 @@ def keyframed_path(
     ):
         check_mean_rate(step, shift, "m/s")
         check_mean_rate(step, rotation, "rad/s")
-        check_mean_rate(step, swing, "rad/s of the hinge")
+        check_mean_rate(step, swing, joint_rate(model))
     at_s = frame_times(float(keys.time_s[-1]))
     shift_m, hinge_rad = smooth(keys.time_s, keys.shift_m, at_s), smooth(keys.time_s, hinge, at_s)
     rotmats = _interpolated_rotations(keys, rotations, at_s)
     return checked_path(model, shift_m, rotmats, hinge_rad, steps, limits_rad, standing)
+
+
+def _check_joint(model: ObjectModel, keys: Keyframes, source: str) -> None:
+    if keys.hinge_rad is None or not keys.hinge_rad.any():
+        return
+    if model.hinge is None:
+        remedy = 'give the hinge (--hinge "px,py,pz dx,dy,dz"), or remove the column'
+        raise BadInput(source, f"no hinge angle: {model.name!r} is rigid", "a column hinge_...", remedy)
+    if model.hinge.is_prismatic != keys.is_slide:
+        columns = ("hinge_deg", "slide_cm")
+        expected, got = columns[model.hinge.is_prismatic], columns[keys.is_slide]
+        kind = "slides" if model.hinge.is_prismatic else "turns"
+        raise BadInput(source, f"a column {expected}: {model.name!r} {kind}", f"a column {got}", "rename the column")
 
 
 def _rotations_between(keys: Keyframes, source: str) -> np.ndarray:
@@ -235,11 +260,14 @@ def _keyframes(columns: dict[str, np.ndarray], count: int, source: str) -> Keyfr
     if np.abs(shift).max() > 5:
         got = f"{np.abs(shift).max():g} m"
         raise BadInput(source, "positions within 5 m", got, "write the unit of the numbers: x_cm or x_mm")
+    if "hinge" in columns and "slide" in columns:
+        raise BadInput(source, "hinge_... or slide_...", "both", "an object has one joint: remove one of the columns")
+    joint = columns.get("hinge", columns.get("slide"))
     rotation = _rotation_columns(columns, count, source)
     if isinstance(rotation, Rotation):
-        return Keyframes(time_s, shift, rotation.as_matrix(), columns.get("hinge"))
+        return Keyframes(time_s, shift, rotation.as_matrix(), joint, is_slide="slide" in columns)
     rotmats = Rotation.from_rotvec(rotation).as_matrix()
-    return Keyframes(time_s, shift, rotmats, hinge_rad=columns.get("hinge"), rotvec_rad=rotation)
+    return Keyframes(time_s, shift, rotmats, joint, rotation, is_slide="slide" in columns)
 
 
 def _rotation_columns(columns: dict[str, np.ndarray], count: int, source: str) -> np.ndarray | Rotation:

@@ -25,12 +25,13 @@ LIMITS = {
     "m/s": (2.5, 40.0),
     "rad/s": (12.0, 200.0),
     "rad/s of the hinge": (12.0, 200.0),
+    "m/s of the slide": (2.5, 40.0),
 }
 # Minimum-jerk motion from stop to stop: peak speed x time / distance, and peak acceleration x time^2 / distance.
 MINIMUM_JERK_PEAKS = 15 / 8, 10 / math.sqrt(3)
-ANY_HINGE_RAD = (-math.pi, math.pi)  # of a hinge without known limits
+ANY_HINGE_RAD, ANY_SLIDE_M = (-math.pi, math.pi), (-2.0, 2.0)  # of joints without known limits
 TABLE_TOLERANCE_M = 0.003  # meshes do not stand on the table exactly
-ANGLE_TOLERANCE_RAD = np.radians(0.5)
+ANGLE_TOLERANCE_RAD, SLIDE_TOLERANCE_M = np.radians(0.5), 0.001
 _CHUNK_FRAMES = 64
 
 
@@ -49,7 +50,7 @@ class ObjectPath:
 
     track: ObjectTrack
     steps: tuple[PathStep, ...]
-    limits_rad: tuple[float, float] | None = None  # smallest and largest hinge angle, if known
+    limits_rad: tuple[float, float] | None = None  # smallest and largest joint position, if known
 
 
 def smooth(time_s: np.ndarray, values: np.ndarray, at_s: np.ndarray) -> np.ndarray:
@@ -93,9 +94,9 @@ def checked_path(
         model: the object.
         shift_m: (frame, 3) translation from the start.
         rotmats: (frame, 3, 3) rotation from the start, about the centre of the bounding box.
-        hinge_rad: (frame,) hinge angle.
+        hinge_rad: (frame,) joint position as in ``ObjectTrack``.
         steps: time intervals, for error messages.
-        limits_rad: smallest and largest hinge angle, if known.
+        limits_rad: smallest and largest joint position, if known.
         standing: (3, 3) world-from-object at the start, if the object's z axis is not up.
 
     Raises:
@@ -128,16 +129,31 @@ def _steps_at(path: ObjectPath, frame: int) -> list[PathStep]:
 
 
 def _check_angle(path: ObjectPath, hinge_rad: np.ndarray) -> None:
-    low, high = path.limits_rad or ANY_HINGE_RAD
+    slides = path.track.model.hinge is not None and path.track.model.hinge.is_prismatic
+    low, high = path.limits_rad or (ANY_SLIDE_M if slides else ANY_HINGE_RAD)
+    tolerance = SLIDE_TOLERANCE_M if slides else ANGLE_TOLERANCE_RAD
     beyond = np.maximum(hinge_rad - high, low - hinge_rad)
     frame = int(beyond.argmax())
-    if beyond[frame] > ANGLE_TOLERANCE_RAD:
-        expected = f"a hinge angle of {np.degrees(low):.0f} to {np.degrees(high):.0f} deg"
-        first = int((beyond > ANGLE_TOLERANCE_RAD).argmax())
-        got = f"{np.degrees(hinge_rad[frame]):.0f} deg, from {_step_at(path, first)} on"
+    if beyond[frame] > tolerance:
+        expected = f"{'a slide' if slides else 'a hinge angle'} of {joint_range_words((low, high), slides)}"
+        first = int((beyond > tolerance).argmax())
+        position = f"{100 * hinge_rad[frame]:.1f} cm" if slides else f"{np.degrees(hinge_rad[frame]):.0f} deg"
+        got = f"{position}, from {_step_at(path, first)} on"
         raise BadInput(
             "object path", expected, got, "choose an angle within, or give the hinge's range (--hinge-range)"
         )
+
+
+def joint_range_words(limits: tuple[float, float], slides: bool) -> str:
+    """A range of joint positions, such as "0 to 110 deg" or "0.0 to 30.0 cm"."""
+    if slides:
+        return f"{100 * limits[0]:.1f} to {100 * limits[1]:.1f} cm"
+    return f"{np.degrees(limits[0]):.0f} to {np.degrees(limits[1]):.0f} deg"
+
+
+def joint_rate(model: ObjectModel) -> str:
+    """The key of ``LIMITS`` for the joint of an object."""
+    return "m/s of the slide" if model.hinge is not None and model.hinge.is_prismatic else "rad/s of the hinge"
 
 
 def check_mean_rate(step: PathStep, change: np.ndarray, unit: str) -> None:
@@ -156,7 +172,7 @@ def check_mean_rate(step: PathStep, change: np.ndarray, unit: str) -> None:
 
 
 def _check_rates(path: ObjectPath, shift_m: np.ndarray, rotmats: np.ndarray, hinge_rad: np.ndarray) -> None:
-    rates = list(_rates(shift_m, rotmats, hinge_rad))
+    rates = list(_rates(path.track.model, shift_m, rotmats, hinge_rad))
     for rate in rates:
         frame = int(rate.size.argmax())
         if rate.size[frame] > rate.limit:
@@ -176,7 +192,7 @@ def check_pace(track: ObjectTrack, pace: float, source: str) -> None:
     centre = (track.model.vertices_m.min(axis=0) + track.model.vertices_m.max(axis=0)) / 2
     hinge = np.zeros(track.n_frames) if track.hinge_rad is None else track.hinge_rad.astype(np.float64)
     pose = track.world_from_object
-    rates = list(_rates((pose @ centre[None])[:, 0], pose.rotation, hinge))
+    rates = list(_rates(track.model, (pose @ centre[None])[:, 0], pose.rotation, hinge))
     for rate in rates:
         largest = float(rate.size.max()) / pace**rate.order
         if largest > rate.limit:
@@ -202,14 +218,14 @@ class _Rate(NamedTuple):
         return (float(self.size[frames].max(initial=0.0)) / self.limit) ** (1 / self.order)
 
 
-def _rates(position_m: np.ndarray, rotmats: np.ndarray, hinge_rad: np.ndarray) -> Iterator[_Rate]:
-    """Speed and acceleration of translation, rotation and hinge, if there are enough frames."""
+def _rates(model: ObjectModel, position_m: np.ndarray, rotmats: np.ndarray, hinge_rad: np.ndarray) -> Iterator[_Rate]:
+    """Speed and acceleration of translation, rotation and joint, if there are enough frames."""
     angular = rotmat_to_rotvec(rotmats[1:] @ rotmats[:-1].swapaxes(1, 2)) * FPS
     velocities = np.diff(position_m, axis=0) * FPS, angular, np.diff(hinge_rad)[:, None] * FPS
-    for (unit, limits), velocity in zip(LIMITS.items(), velocities, strict=True):
+    for unit, velocity in zip(("m/s", "rad/s", joint_rate(model)), velocities, strict=True):
         for order, values in ((1, velocity), (2, np.diff(velocity, axis=0) * FPS)):
             if len(values):
-                yield _Rate(unit, order, np.linalg.norm(values, axis=1), limits[order - 1])
+                yield _Rate(unit, order, np.linalg.norm(values, axis=1), LIMITS[unit][order - 1])
 
 
 def _slower(step: PathStep, needed_s: float) -> str:

@@ -11,8 +11,10 @@ import trimesh
 from scipy.spatial import QhullError
 
 from hoidata.errors import BadInput
+from hoidata.geometry.rows import distinct_rows
 from hoidata.objects.ply import MOST_CORNERS, MOST_TRIANGLES, MOST_VERTICES, parse_ply
 from hoidata.objects.solid import encloses
+from hoidata.objects.stl import parse_stl
 
 LARGEST_MESH_BYTES = 64 << 20  # a million vertices as text, which take fifteen times as much memory
 _MOST = f"at most {MOST_VERTICES} vertices, {MOST_TRIANGLES} triangles and {MOST_CORNERS} corners of one face"
@@ -47,9 +49,10 @@ class MassProperties(NamedTuple):
 
 
 def load_mesh(path: str | Path) -> Mesh:
-    """Read vertices and triangles of an OBJ or PLY file; polygons become fans.
+    """Read vertices and triangles of an OBJ, PLY or STL file; polygons become fans.
 
     The reader does not merge, reorder or drop vertices, because per-vertex files (part ids, contacts) index them.
+    Only equal corners of an STL file, which has no shared vertices, are merged and sorted.
 
     Raises:
         BadInput: the file holds no finite triangle mesh.
@@ -58,16 +61,16 @@ def load_mesh(path: str | Path) -> Mesh:
 
 
 def load_named_mesh(path: str | Path) -> tuple[Mesh, list[NamedPieces]]:
-    """Read a mesh as ``load_mesh`` does, with the named objects and groups of an OBJ file."""
+    """Read a mesh as ``load_mesh`` does, with the named objects and groups of an OBJ file, and the solids of an STL."""
     path = Path(path)
     if not path.is_file():
         raise BadInput(path, "a mesh file", "nothing there")
     if path.stat().st_size > LARGEST_MESH_BYTES:
         raise BadInput(path, f"at most {LARGEST_MESH_BYTES} bytes", f"{path.stat().st_size}", "decimate the mesh")
-    reader = {".obj": _read_obj, ".ply": _read_ply}.get(path.suffix.lower())
+    reader = {".obj": _read_obj, ".ply": _read_ply, ".stl": _read_stl}.get(path.suffix.lower())
     if reader is None:
-        remedy = "read .stl and .glb with hoidata.objects.user_mesh.read_mesh_file; convert others"
-        raise BadInput(path, "a mesh named .obj or .ply", path.suffix or "no suffix", remedy)
+        remedy = "read .glb with hoidata.objects.user_mesh.read_mesh_file; convert others"
+        raise BadInput(path, "a mesh named .obj, .ply or .stl", path.suffix or "no suffix", remedy)
     try:
         mesh, pieces = reader(path)
     except (ValueError, OSError) as error:
@@ -177,6 +180,12 @@ def _vertex_number(corner: str, n_vertices: int) -> int:
 
 def _read_ply(path: Path) -> tuple[Mesh, list[NamedPieces]]:
     return Mesh(*parse_ply(path.read_bytes())), []
+
+
+def _read_stl(path: Path) -> tuple[Mesh, list[NamedPieces]]:
+    corners, solid, names = parse_stl(path.read_bytes())
+    first, number = distinct_rows(corners)
+    return Mesh(corners[first], number.reshape(-1, 3)), [NamedPieces("solids", names, solid)]
 
 
 def checked_mesh(path: str | Path, mesh: Mesh) -> Mesh:

@@ -18,15 +18,38 @@ SEAM = 2  # in ``ObjectModel.face_part``: a triangle with corners on both parts
 
 @dataclass(frozen=True)
 class Hinge:
-    """One revolute joint: angle q moves a point p of the moving part to ``R(axis * q) (p - origin) + origin``."""
+    """The joint of an articulated object, which moves a point p of the moving part.
+
+    Revolute: angle q moves it to ``R(axis * q) (p - origin) + origin``. Prismatic: displacement q moves it to
+    ``p + axis * q``.
+    """
 
     axis: np.ndarray  # (3,) unit vector, object frame
-    origin_m: np.ndarray  # (3,) a point on the axis, object frame
+    origin_m: np.ndarray  # (3,) a point on the axis, object frame; zeros for a prismatic joint
+    is_prismatic: bool = False
+
+    @property
+    def unit(self) -> str:
+        """The unit of joint positions."""
+        return "m" if self.is_prismatic else "rad"
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """Axis, and origin of a revolute joint: the stored arrays, from which digests are computed."""
+        return (self.axis,) if self.is_prismatic else (self.axis, self.origin_m)
 
     def turn(self, hinge_rad: np.ndarray) -> RigidTransform:
-        """``object_from_part`` of the moving part at angles (frame,), radians."""
-        rotvec = np.asarray(self.axis, dtype=np.float64) * np.asarray(hinge_rad, dtype=np.float64)[..., None]
-        return RigidTransform(rotvec_to_rotmat(rotvec), self.origin_m, self.origin_m)
+        """``object_from_part`` of the moving part at joint positions (frame,), radians; metres if prismatic."""
+        along = np.asarray(self.axis, dtype=np.float64) * np.asarray(hinge_rad, dtype=np.float64)[..., None]
+        if self.is_prismatic:
+            return RigidTransform(np.broadcast_to(np.eye(3), (*along.shape, 3)), along)
+        return RigidTransform(rotvec_to_rotmat(along), self.origin_m, self.origin_m)
+
+    def node_motion(self, hinge_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Translations (frame, 3) and axis-angles (frame, 3) of a scene node at ``origin_m`` that moves the part."""
+        along = self.axis * np.asarray(hinge_rad)[:, None]
+        origin_m = np.broadcast_to(self.origin_m, along.shape)
+        return (origin_m + along, np.zeros_like(along)) if self.is_prismatic else (origin_m, along)
 
 
 @dataclass(frozen=True)
@@ -70,6 +93,17 @@ class ObjectModel:
         """Number of triangles that span both parts. Distances and sampled points exclude them."""
         return int((self.face_part == SEAM).sum())
 
+    @cached_property
+    def joint_scale(self) -> float:
+        """Joint position that counts as one radian: 1 for a hinge, the moving part's radius in metres for a slide.
+
+        Networks and measures of motion know angles. A hinge moves a point at this distance as far as the slide.
+        """
+        if self.hinge is None or not self.hinge.is_prismatic:
+            return 1.0
+        moving_m = self.vertices_m[self.part == 1]
+        return float(np.linalg.norm(moving_m - moving_m.mean(axis=0), axis=1).max())
+
     def faces_of(self, part: int) -> np.ndarray:
         """(face, 3) faces of one part."""
         return self.faces[self.face_part == part] if self.is_articulated else self.faces
@@ -110,7 +144,7 @@ class ObjectModel:
     @cached_property
     def digest(self) -> str:
         """SHA-256 of name, mesh, parts and hinge."""
-        hinge = () if self.hinge is None else (self.hinge.axis, self.hinge.origin_m)
+        hinge = () if self.hinge is None else self.hinge.arrays
         digest = hashlib.sha256(self.name.encode())
         for array in (self.vertices_m, self.faces, self.part, *hinge):
             digest.update(f"{array.dtype.str}{array.shape}".encode())
@@ -151,6 +185,13 @@ class ObjectModel:
             heights_m = [(vertices_m @ up_in_part[start : start + _CHUNK_FRAMES].T).min(axis=0) for start in starts]
             lowest.append(np.concatenate([np.zeros(0), *heights_m]) + origins_m)
         return np.minimum.reduce(lowest)
+
+
+def joint_vectors(model: ObjectModel) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation axis (3,) and displacement (3,) in metres per radian of ``ObjectTrack.joint_angle_rad``, or zeros."""
+    axis = np.zeros(3) if model.hinge is None else model.hinge.axis
+    is_prismatic = model.hinge is not None and model.hinge.is_prismatic
+    return (np.zeros(3), axis * model.joint_scale) if is_prismatic else (axis, np.zeros(3))
 
 
 def articulate(points_m: np.ndarray, part: np.ndarray, hinge: Hinge | None, hinge_rad: np.ndarray | None) -> np.ndarray:

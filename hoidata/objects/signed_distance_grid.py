@@ -15,7 +15,7 @@ from torch import Tensor
 
 from hoidata.devices import send
 from hoidata.geometry.rotations import rotvec_to_rotmat
-from hoidata.objects.model import ObjectModel
+from hoidata.objects.model import ObjectModel, joint_vectors
 from hoidata.objects.surface_index import surface_index
 
 MARGIN_M = 0.03
@@ -32,7 +32,7 @@ class DistanceFields:
         """Compute the grids of (key, model) pairs with ``resolution`` nodes along each axis."""
         self.resolution = resolution
         self.row: dict[str, int] = {}
-        values, low, high, axis, origin = [], [], [], [], []
+        values, low, high, axis, origin, slide = [], [], [], [], [], []
         for key, model in objects:
             if key in self.row:
                 continue
@@ -40,11 +40,12 @@ class DistanceFields:
             for part in range(2):
                 for stack, value in zip((values, low, high), _part_values(model, part, resolution), strict=True):
                     stack.append(value)
-            axis.append(np.zeros(3) if model.hinge is None else model.hinge.axis)
+            for stack, vector in zip((axis, slide), joint_vectors(model), strict=True):
+                stack.append(vector)
             origin.append(np.zeros(3) if model.hinge is None else model.hinge.origin_m)
         self.values = torch.from_numpy(np.concatenate(values))
         self.low, self.high = _tensor(low).reshape(-1, 2, 3), _tensor(high).reshape(-1, 2, 3)
-        self.axis, self.origin = _tensor(axis), _tensor(origin)
+        self.axis, self.origin, self.slide_m = _tensor(axis), _tensor(origin), _tensor(slide)
 
     def rows(self, keys: Sequence[str]) -> Tensor:
         """(clip,) indices of objects by key."""
@@ -52,7 +53,7 @@ class DistanceFields:
 
     def to(self, device: torch.device | str) -> "DistanceFields":
         """Move the grids to a device. Returns self."""
-        for name in ("values", "low", "high", "axis", "origin"):
+        for name in ("values", "low", "high", "axis", "origin", "slide_m"):
             setattr(self, name, getattr(self, name).to(device))
         return self
 
@@ -62,7 +63,7 @@ class DistanceFields:
         Args:
             rows: (B,) indices of objects.
             points_m: (B, F, P, 3).
-            hinge_rad: (B, F).
+            hinge_rad: (B, F) ``ObjectTrack.joint_angle_rad``.
 
         Returns:
             Distances (B, F, P) and offsets (B, F, P, 3), metres.
@@ -71,7 +72,8 @@ class DistanceFields:
         rotation = rotvec_to_rotmat(self.axis[rows][:, None] * hinge_rad[..., None])
         origin = self.origin[rows][:, None, None]
         base = self._read(rows, 0, points_m)
-        lid = self._read(rows, 1, (points_m - origin) @ rotation + origin)
+        slid_m = (self.slide_m[rows][:, None] * hinge_rad[..., None])[..., None, :]
+        lid = self._read(rows, 1, (points_m - origin - slid_m) @ rotation + origin)
         lid = torch.cat((lid[..., :1], lid[..., 1:] @ rotation.transpose(-1, -2)), -1)
         nearest = torch.where(base[..., :1] <= lid[..., :1], base, lid)
         return nearest[..., 0], nearest[..., 1:]

@@ -1,6 +1,8 @@
-"""Reads a user's mesh as an object. Unit, up axis and hinge are given, or guessed and reported."""
+"""Reads a user's mesh or URDF as an object. Unit, up axis and joint are given, or guessed and reported."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from os.path import isdir, isfile  # False for a name that is too long, where Path.is_file raises
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +17,7 @@ from hoidata.objects.glb import Glb, parse_glb
 from hoidata.objects.mesh import LARGEST_MESH_BYTES, Mesh, NamedPieces, checked_mesh, load_named_mesh
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.stl import parse_stl
+from hoidata.objects.urdf import PARTNET_NAME, UrdfObject, find_urdf, read_urdf
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "dm": 0.1, "inch": 0.0254}
 SMALLEST_M, LARGEST_M = 0.005, 2.0
@@ -38,47 +41,85 @@ class UserObject:
 
     model: ObjectModel  # metres, z up, with the file's origin
     notes: tuple[str, ...]  # assumptions, as sentences for the user
+    joint_limits: tuple[float, float] | None = None  # lowest and highest joint position of a URDF, radians or metres
 
 
-def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "") -> UserObject:
-    """Read an object from an OBJ, PLY, STL or GLB file.
+def is_object_path(name: str) -> bool:
+    """Whether a text is the path of a file, or of a folder with a URDF file."""
+    return isfile(name) or (isdir(name) and find_urdf(Path(name)) is not None)
+
+
+def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "", moving: str = "") -> UserObject:
+    """Read an object from an OBJ, PLY, STL, GLB or URDF file, or from a folder with a URDF file.
 
     Args:
-        path: the mesh file.
+        path: the file or folder.
         unit: "m", "cm", "mm", "dm" or "inch"; metres by default.
-        up: the file's axis that points up, such as "z" or "-y"; guessed by default (GLB: y).
-        hinge: "px,py,pz dx,dy,dz", a point on the axis and its direction in the file's unit and axes. The mesh must
-            have two pieces, of which the second in the file moves. Pieces are the objects, groups, nodes or solids that
-            the file names if there are two, else the shells.
+        up: the file's axis that points up, such as "z" or "-y"; guessed by default (GLB: y, URDF: z).
+        hinge: of a mesh file "px,py,pz dx,dy,dz", a point on the axis and its direction in the file's unit and axes; or
+            "dx,dy,dz", the direction of a slide. The mesh must have two pieces, of which the second in the file moves.
+            Pieces are the objects, groups, nodes or solids that the file names if there are two, else the shells.
+        moving: what moves: the joint of a URDF, or the objects, groups or nodes of a mesh, separated by commas.
 
     Raises:
-        BadInput: the size is implausible (the error suggests a unit), or the hinge does not fit.
+        BadInput: the size is implausible (the error suggests a unit), or the joint does not fit.
     """
-    file = _read(path)
-    mesh, part, pieces = _in_two_pieces(path, file) if hinge else (_joined(file), None, ("", ""))
-    scale, notes = _scale(path, mesh, unit), list[str]()
+    if moving and not hinge and find_urdf(path) is None:
+        raise BadInput("--moving", "--hinge too, the axis of what moves", moving[:80], "give both")
+    body = _body(path, hinge, moving)
+    mesh, notes = body.mesh, list(body.notes)
+    scale = _scale(path, mesh, unit)
     vertices = mesh.vertices * scale
     if not up:
-        up, note = ("y", "y is up, as in every GLB file") if _is_gltf(path) else guess_up(vertices)
+        up, note = _usual_up(path) or guess_up(vertices)
         notes.append(f"{note}; --up chooses another")
     if up not in UP_AXES:
         raise BadInput("--up", f"one of {', '.join(UP_AXES)}", up, "name the axis of the file that points up")
     upright_from_file = _upright_from_file(UP_AXES[up])
-    hinge_joint = _hinge(hinge, scale, upright_from_file) if hinge else None
-    part = np.zeros(len(vertices), np.uint8) if part is None else part
-    name = path.stem.encode(errors="backslashreplace").decode()  # bytes that are not text stay legible
-    model = ObjectModel(name, vertices @ upright_from_file.T, mesh.faces, part=part, hinge=hinge_joint)
-    if all(pieces):
-        notes.append(f"{pieces[1]!r} turns about the hinge, {pieces[0]!r} stays")
-    if hinge_joint and closes(model):
+    joint, limits = body.hinge, body.limits
+    if joint:
+        joint = replace(joint, axis=upright_from_file @ joint.axis, origin_m=upright_from_file @ joint.origin_m * scale)
+    if joint and joint.is_prismatic and limits:
+        limits = (limits[0] * scale, limits[1] * scale)
+    stem = path.resolve().parent.name if path.name == PARTNET_NAME else path.stem
+    name = stem.encode(errors="backslashreplace").decode()  # bytes that are not text stay legible
+    model = ObjectModel(name, vertices @ upright_from_file.T, mesh.faces, part=body.part, hinge=joint)
+    if hinge and joint and closes(model):
         notes.append("a growing angle brings the two pieces together; if it is to open them, turn its direction round")
-    return UserObject(model, tuple(notes))
+    return UserObject(model, tuple(notes), limits)
+
+
+def _body(path: Path, hinge: str, moving: str) -> UrdfObject:
+    """Mesh, parts and joint of a file, in its unit and axes."""
+    if urdf := find_urdf(path):
+        if hinge:
+            raise BadInput(
+                "--hinge", "no hinge with a URDF, which has joints", hinge[:80], "--moving JOINT chooses one"
+            )
+        root = path if path.is_dir() else path.parent
+        return read_urdf(urdf, root, moving, read_mesh_file)
+    file = _read(path)
+    if not hinge:
+        mesh = _joined(file)
+        return UrdfObject(mesh, np.zeros(len(mesh.vertices), np.uint8), None, None, [])
+    joint = _hinge(hinge)
+    mesh, part, (stays, moves) = _in_two_pieces(
+        path, file, [name.strip() for name in moving.split(",") if name.strip()]
+    )
+    verb = "slides" if joint.is_prismatic else "turns about the hinge"
+    return UrdfObject(mesh, part, joint, None, [f"{moves!r} {verb}, {stays!r} stays"] if stays and moves else [])
+
+
+def _usual_up(path: Path) -> tuple[str, str] | None:
+    if find_urdf(path):
+        return "z", "z is up, as usual in URDF files"
+    return ("y", "y is up, as in every GLB file") if _is_gltf(path) else None
 
 
 def closes(model: ObjectModel) -> bool:
     """Whether the centre of an articulated object's moving part approaches that of its base as the angle grows."""
     base, moving = (masses.centre_m for masses in model.masses)
-    angles_rad = np.array([-CLOSING_TEST_RAD, CLOSING_TEST_RAD])
+    angles_rad = np.array([-CLOSING_TEST_RAD, CLOSING_TEST_RAD]) * model.joint_scale
     before, after = articulate(moving[None], np.ones(1), model.hinge, angles_rad)[:, 0]
     return bool(np.linalg.norm(after - base) < (1 - CLOSING_FRACTION) * np.linalg.norm(before - base))
 
@@ -178,8 +219,11 @@ def _joined(file: _MeshFile) -> Mesh:
     return Mesh(file.mesh.vertices[used[first]], number[corner].reshape(-1, 3))
 
 
-def _in_two_pieces(path: Path, file: _MeshFile) -> tuple[Mesh, np.ndarray, tuple[str, str]]:
+def _in_two_pieces(path: Path, file: _MeshFile, moving: Sequence[str] = ()) -> tuple[Mesh, np.ndarray, tuple[str, str]]:
     """Divide a mesh into two pieces, in the order of the file. Vertices that both pieces use are duplicated.
+
+    Args:
+        moving: names of the objects, groups or nodes that are the second piece; by default there must be two pieces.
 
     Returns:
         The mesh, (vertex,) 1 for vertices of the second piece, and the names of the pieces.
@@ -188,19 +232,44 @@ def _in_two_pieces(path: Path, file: _MeshFile) -> tuple[Mesh, np.ndarray, tuple
         BadInput: no division of the file has two pieces.
     """
     divisions = _divisions(file)
-    pieces = _division_into_two(divisions)
+    pieces = _named_as_moving(path, file, moving) if moving else _division_into_two(divisions)
     if pieces is None:
         counts = dict.fromkeys((division.kind, len(_order(division))) for division in divisions)
         got = ", ".join(f"{count} {kind}" for kind, count in counts if count > 1) or "one shell"
-        remedy = "export a base and what moves as two objects or nodes; each may have any number of shells"
+        remedy = "export a base and what moves as two objects or nodes; or name what moves: --moving NAME,NAME"
         raise BadInput(path, "two separate pieces for --hinge", got, remedy)
-    moves = pieces.of_face == _order(pieces)[1]
+    stays, moves_number = (0, 1) if moving else _order(pieces)
+    moves = pieces.of_face == moves_number
     faces = file.mesh.faces
     key, first_use, number = np.unique(
         2 * _merged_within_source(file)[faces] + moves[:, None], return_index=True, return_inverse=True
     )
     mesh = Mesh(file.mesh.vertices[faces.ravel()[first_use]], number.reshape(-1, 3))
-    return mesh, (key % 2).astype(np.uint8), _names(pieces)
+    names = (pieces.names[stays], pieces.names[moves_number]) if pieces.names else ("", "")
+    return mesh, (key % 2).astype(np.uint8), names
+
+
+def _named_as_moving(path: Path, file: _MeshFile, moving: Sequence[str]) -> NamedPieces:
+    """The division into the named pieces, which move, and all others. Raises BadInput that lists the names."""
+    for pieces in file.pieces:
+        present = {pieces.names[number]: number for number in _order(pieces)} if pieces.names else {}
+        numbers = [present[name] for name in moving if name in present]
+        if len(numbers) == len(moving) and len(numbers) < len(present):
+            moves = np.isin(pieces.of_face, numbers)
+            others = [name for name in present if name not in moving]
+            names = [", ".join(others), ", ".join(moving)]
+            return NamedPieces(pieces.kind, names, moves.astype(np.int64))
+    listed = "; ".join(
+        f"{pieces.kind}: {', '.join(pieces.names[number] for number in _order(pieces)[:20])}"
+        for pieces in file.pieces
+        if pieces.names
+    )
+    raise BadInput(
+        path,
+        "names of some pieces for --moving",
+        f"{', '.join(moving)}; there are: {listed or 'none'}",
+        "name what moves",
+    )
 
 
 def piece_names(path: Path) -> tuple[str, str] | None:
@@ -280,18 +349,20 @@ def _upright_from_file(up: np.ndarray) -> np.ndarray:
     return rotation
 
 
-def _hinge(text: str, scale: float, upright_from_file: np.ndarray) -> Hinge:
+def _hinge(text: str) -> Hinge:
+    """The joint in the unit and axes of the file: a hinge, or a slide without a point on its axis."""
     try:
-        point, direction = (np.array([float(number) for number in word.split(",")]) for word in text.split())
+        vectors = [np.array([float(number) for number in word.split(",")]) for word in text.split()]
+        point, direction = vectors if len(vectors) != 1 else (np.zeros(3), vectors[0])
         if point.shape != (3,) or direction.shape != (3,) or not np.isfinite([point, direction]).all():
             raise ValueError
         length = np.linalg.norm(direction)
         if length < 1e-9:
             raise ValueError
     except ValueError as error:
-        remedy = 'write a point on the axis, then its direction, like "0,0.1,0.05 1,0,0"'
+        remedy = 'write a point on the axis, then its direction, like "0,0.1,0.05 1,0,0"; a slide has only a direction'
         raise BadInput("--hinge", "two times three numbers", text[:80], remedy) from error
-    return Hinge(upright_from_file @ direction / length, upright_from_file @ point * scale)
+    return Hinge(direction / length, point, len(vectors) == 1)
 
 
 def _shells(faces: np.ndarray, same: np.ndarray) -> NamedPieces:

@@ -84,7 +84,7 @@ def _refined(pair: HandPair, clip: Clip, side: Side, other: Capsules | None) -> 
 
 def _passed(target: ObjectTrack, grasps: Sequence[Interval]) -> np.ndarray | None:
     """(frame,) bool: grasps in which one part of an object moves past the other; None where there are none."""
-    hinge_rad, passed = target.hinge_rad, np.zeros(target.n_frames, bool)
+    hinge_rad, passed = target.joint_angle_rad, np.zeros(target.n_frames, bool)
     for start, stop in grasps:
         passed[start:stop] = hinge_rad is not None and np.ptp(hinge_rad[start:stop]) > PASSING_RAD
     return passed if passed.any() else None

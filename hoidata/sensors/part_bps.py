@@ -21,7 +21,7 @@ from scipy.spatial import KDTree
 
 from hoidata.geometry.transform import IDENTITY, RigidTransform
 from hoidata.objects.distance_grid import nearest_triangles
-from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import PartSurface, surface_index
 
 Nearest = Literal["vertex", "surface"]
@@ -70,7 +70,8 @@ class NearestPoints(NamedTuple):
 def canonical_object(model: ObjectModel, frame: CanonicalFrame = "axis") -> tuple[ObjectModel, RigidTransform]:
     """Move an object to its canonical frame.
 
-    With a hinge, z points against the hinge axis and the origin is the point of the axis nearest to the surface centre.
+    With a joint, z points against its axis. The origin is the point of a hinge axis nearest to the surface centre, and
+    the surface centre itself for a prismatic joint.
     A hinge along -z through the origin is not moved (frame "axis"). A rigid object keeps its axes; its surface
     centre becomes the origin.
 
@@ -80,7 +81,7 @@ def canonical_object(model: ObjectModel, frame: CanonicalFrame = "axis") -> tupl
     origin, rotation = _surface_centre_m(model.vertices_m, model.faces), np.eye(3)
     if model.hinge is not None:
         axis = np.asarray(model.hinge.axis, np.float64)
-        on_axis = np.asarray(model.hinge.origin_m, np.float64)
+        on_axis = origin if model.hinge.is_prismatic else np.asarray(model.hinge.origin_m, np.float64)
         origin = on_axis + axis * ((origin - on_axis) @ axis)
         rotation = _rotation_from_minus_z(axis)
         if frame == "axis" and np.array_equal(axis, (0, 0, -1)) and not on_axis.any():
@@ -90,7 +91,9 @@ def canonical_object(model: ObjectModel, frame: CanonicalFrame = "axis") -> tupl
             rotation = rotation @ _rotation_about_z((base_centre - origin) @ rotation)
     object_from_canonical = RigidTransform(rotation, origin)
     vertices = object_from_canonical.inverse() @ np.asarray(model.vertices_m, np.float64)
-    hinge = None if model.hinge is None else Hinge(np.array([0.0, 0.0, -1.0]), np.zeros(3))
+    hinge = None
+    if model.hinge is not None:
+        hinge = replace(model.hinge, axis=np.array([0.0, 0.0, -1.0]), origin_m=np.zeros(3))
     return replace(model, vertices_m=vertices, hinge=hinge), object_from_canonical
 
 
@@ -191,6 +194,7 @@ class _PartVertices:
     def __init__(self, model: ObjectModel, part: int, points_m: np.ndarray) -> None:
         self.ids = np.flatnonzero(model.part == part) if model.is_articulated else np.arange(len(model.vertices_m))
         self.vertices_m = np.ascontiguousarray(model.vertices_m[self.ids], np.float64)
+        self.is_prismatic = model.hinge is not None and model.hinge.is_prismatic
         self.object_from_part = lambda angle: model.object_from_part(part, np.array([angle]))
         self.points_m, self.moves = points_m, part == 1 and model.is_articulated
         # Coordinates in LANES rows, so that the compiler vectorises the search; the padding is far from everything.
@@ -222,7 +226,8 @@ class _PartVertices:
             middle = self.object_from_part((arc + 0.5) * ARC_RAD).inverse() @ self.points_m
             radius = np.hypot(self.points_m[:, 0], self.points_m[:, 1]) if self.moves else np.zeros(len(middle))
             # The nearest distance changes by at most the chord from the middle of the arc to its end, in both terms.
-            slack_m = 4 * radius * np.sin(ARC_RAD / 4)
+            # On a slide, an arc is a way of as many metres.
+            slack_m = np.full_like(radius, ARC_RAD) if self.is_prismatic else 4 * radius * np.sin(ARC_RAD / 4)
             points = middle.reshape(-1, 3).astype(np.float32)
             self.arcs[arc] = _vertices_within(self.lanes_m, len(self.ids), points, slack_m + ROUNDING_M)
         return self.arcs[arc]

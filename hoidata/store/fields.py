@@ -88,7 +88,7 @@ def _hand(side: str) -> tuple[Field, ...]:
 
 
 def _object_fields(prefix: str, rows: str, target: str) -> tuple[Field, ...]:
-    hinge = f"unwrapped hinge angle of {target}; 0 for rigid ones"
+    hinge = f"unwrapped hinge angle of {target}; metres of a prismatic joint; 0 for rigid ones"
     return (
         _rotvec(f"{prefix}_rotvec", rows, f"world_from_object of {target}, column vectors"),
         _point(f"{prefix}_translation_m", rows, f"origin of the object frame of {target}"),
@@ -197,7 +197,14 @@ RECORDINGS = StoreFile(
         ),
         _recorded("object_rotvec", "world_from_object, column vectors", "radian"),
         _recorded("object_translation_m", "origin of the object frame", "metre"),
-        Field("object_hinge_rad", "float32", "0 for rigid ones", shape=("frame",), unit="radian", frame="object"),
+        Field(
+            "object_hinge_rad",
+            "float32",
+            "as in frames-*.npz; 0 for rigid ones",
+            shape=("frame",),
+            unit="radian",
+            frame="object",
+        ),
         Field("usable", "bool", "False: tracking failed", shape=("frame",)),
     ),
 )
@@ -360,7 +367,7 @@ OBJECTS = StoreFile(
         Field(
             "hinge_origin_m",
             "float64",
-            "a point of the hinge; null when rigid",
+            "a point of the hinge; null when rigid or prismatic",
             shape=(3,),
             axes=("xyz",),
             unit="metre",

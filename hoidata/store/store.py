@@ -96,6 +96,11 @@ class FrameShard:
 __all__ = ["SCHEMA_VERSION", "Quarantined", "Store", "open_store", "write_store"]
 
 
+def stored_hinge(axis: Any, origin_m: Any) -> Hinge:
+    """The joint of a row of objects.parquet; without an origin it is prismatic."""
+    return Hinge(np.array(axis), np.zeros(3) if origin_m is None else np.array(origin_m), origin_m is None)
+
+
 def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
     """Open a store for reading.
 
@@ -237,7 +242,7 @@ class Store:
             arrays = {key: self._file("objects")[f"{name}/{key}"].copy() for key in ("vertices_m", "faces", "part")}
             hinge = None
             if facts["articulated"]:
-                hinge = Hinge(axis=np.array(facts["hinge_axis"]), origin_m=np.array(facts["hinge_origin_m"]))
+                hinge = stored_hinge(facts["hinge_axis"], facts["hinge_origin_m"])
             self._models[name] = ObjectModel(name, hinge=hinge, **arrays)
         return self._models[name]
 

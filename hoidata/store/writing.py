@@ -129,7 +129,7 @@ class MeshWriter:
                 "n_faces": len(model.faces),
                 "articulated": hinge is not None,
                 "hinge_axis": None if hinge is None else hinge.axis.tolist(),
-                "hinge_origin_m": None if hinge is None else hinge.origin_m.tolist(),
+                "hinge_origin_m": None if hinge is None or hinge.is_prismatic else hinge.origin_m.tolist(),
                 "digest": key[1],
             }
         return key
@@ -157,8 +157,8 @@ def mesh_arrays(model: ObjectModel) -> dict[str, np.ndarray]:
 
 
 def mesh_digest(arrays: dict[str, np.ndarray], model: ObjectModel) -> str:
-    """Return the SHA-256 of vertices_m, faces, part and, for articulated objects, hinge axis and origin (float64)."""
-    hinge = () if model.hinge is None else (model.hinge.axis, model.hinge.origin_m)
+    """Return the SHA-256 of vertices_m, faces, part and, for articulated objects, ``Hinge.arrays`` (float64)."""
+    hinge = () if model.hinge is None else model.hinge.arrays
     ordered = [arrays[field.name] for field in OBJECT_ARRAYS.fields]
     return sha256_bytes(b"".join(array.tobytes() for array in (*ordered, *map(np.float64, hinge))))
 

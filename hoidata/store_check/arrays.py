@@ -10,7 +10,7 @@ import numpy as np
 from hoidata.clips.clip import SIDES
 from hoidata.clips.validation import frame_numbers_rise
 from hoidata.errors import BadInput
-from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.objects.model import ObjectModel
 from hoidata.store.fields import (
     BODY,
     FRAMES,
@@ -26,6 +26,7 @@ from hoidata.store.fields import (
     StoreFile,
 )
 from hoidata.store.mapped import map_npz
+from hoidata.store.store import stored_hinge
 from hoidata.store.writing import mesh_digest, template_key
 from hoidata.store_check.tables import REMEDY, Columns
 
@@ -210,9 +211,8 @@ def _mesh_problems(facts: dict[str, Any], arrays: Arrays) -> Iterator[BadInput]:
         yield BadInput(f"{path}/faces", expected, "none" if not faces.size else "other numbers", REMEDY)
     if mesh["part"].max(initial=0) > 1:
         yield BadInput(f"{path}/part", "0 and 1", f"{mesh['part'].max()}", REMEDY)
-    hinge = None
-    if facts["hinge_axis"] is not None and facts["hinge_origin_m"] is not None:
-        hinge = Hinge(np.array(facts["hinge_axis"]), np.array(facts["hinge_origin_m"]))
+    axis = facts["hinge_axis"]
+    hinge = None if axis is None else stored_hinge(axis, facts["hinge_origin_m"])
     digest = mesh_digest(mesh, ObjectModel(name, hinge=hinge, **mesh))
     if digest != facts["digest"]:
         yield BadInput(f"{OBJECTS.path}: digest of {name}", f"{digest} as its mesh says", f"{facts['digest']}", REMEDY)

@@ -16,7 +16,8 @@ from `fields.py`, which the writer and the checker use.
 - World: the frame of the source, made right-handed. `source_from_world` maps back to the source's frame and unit.
 - A hand's position is its wrist joint in the world, never MANO's `transl`. Finger poses are absolute: zero is the
   flat hand.
-- Object frame: the frame of the mesh, hinge at zero. A hinge rotates part 1 by `R(axis * angle)` about its origin.
+- Object frame: the frame of the mesh, hinge at zero. A hinge rotates part 1 by `R(axis * angle)` about its origin. A
+  prismatic joint moves it by `axis * displacement`.
 - Every number is finite, also where `<side>_valid` is False.
 
 ## Rows of a clip

@@ -124,10 +124,12 @@ def _object_rules(columns: Columns) -> Iterator[BadInput]:
     if columns["object"] != sorted(columns["object"]):
         yield BadInput(f"{path}: object", "sorted names", "another order", REMEDY)
     yield from _each(f"{path}: hinge_axis", columns["hinge_axis"], _is_unit, "a vector of length 1")
-    for name in ("hinge_axis", "hinge_origin_m"):
-        pairs = list(zip(columns["articulated"], columns[name], strict=True))
-        expected = "(articulated, value) with a value exactly for articulated objects"
-        yield from _each(f"{path}: {name}", pairs, lambda pair: pair[0] == (pair[1] is not None), expected)
+    pairs = list(zip(columns["articulated"], columns["hinge_axis"], strict=True))
+    expected = "(articulated, value) with a value exactly for articulated objects"
+    yield from _each(f"{path}: hinge_axis", pairs, lambda pair: pair[0] == (pair[1] is not None), expected)
+    pairs = list(zip(columns["articulated"], columns["hinge_origin_m"], strict=True))
+    expected = "(articulated, value) without a value for rigid objects"
+    yield from _each(f"{path}: hinge_origin_m", pairs, lambda pair: pair[0] or pair[1] is None, expected)
 
 
 def _file_rules(columns: Columns) -> Iterator[BadInput]:

@@ -80,7 +80,7 @@ class Scene:
     object_point_m: np.ndarray  # (frame, N, 3) the object point nearest to each basis point, canonical frame
     point_exists: np.ndarray  # (N,) bool, False for points of a part that the object does not have
     object_scale: float  # s_o of eq. 1, per metre
-    hinge_rad: np.ndarray  # (frame,)
+    hinge_rad: np.ndarray  # (frame,) as in ``ObjectTrack``
     model_from_canonical: RigidTransform  # (frame,)
     object_from_canonical: RigidTransform  # the same in all frames
     bps: PartBps
@@ -93,7 +93,9 @@ class Scene:
         """Build from features (frame, 10) in the model frame (``hoidata.clips.features``)."""
         object_features = object_features.astype(np.float64)
         bps, object_from_canonical = _basis_structures(_ModelIdentity(model), basis)
-        hinge_rad = object_features[:, OBJECT_HINGE] if model.is_articulated else np.zeros(len(object_features))
+        hinge_rad = np.zeros(len(object_features))
+        if model.is_articulated:
+            hinge_rad = object_features[:, OBJECT_HINGE] * model.joint_scale
         rotation = rot6d_to_rotmat(object_features[:, OBJECT_ROTATION_6D])
         model_from_object = RigidTransform(rotation, object_features[:, OBJECT_POSITION])
         nearest = bps.nearest_points(hinge_rad)

@@ -156,7 +156,9 @@ def motion_clip(request: Request, hands: Tensor, objects: Tensor, synthetic: boo
     refuse_not_finite(request, hands[torch.from_numpy(request.active_hands).to(hands.device)], objects)
     hands, objects = hands[:, : request.n_frames].cpu().double(), objects[: request.n_frames].cpu().double()
     rotation, origin = request.world_from_model[:3, :3], request.world_from_model[:3, 3]
-    hinge = object_hinge_rad(objects).float().numpy() if request.object.is_articulated else None
+    hinge = None
+    if request.object.is_articulated:
+        hinge = object_hinge_rad(objects).float().numpy() * np.float32(request.object.joint_scale)
     return Clip(
         clip_id=request.motion_id,
         dataset="generated",

@@ -136,11 +136,12 @@ def _moved(hands: Tensor, rotation: Tensor, origin: Tensor) -> Tensor:
 
 
 def place_points(batch: RequestBatch, objects: Tensor) -> Tensor:
-    """Object points (B, F, 1024, 3) at each pose (B, F, 10), with the moving part rotated about its hinge."""
+    """Object points (B, F, 1024, 3) at each pose (B, F, 10), with the moving part moved by its joint."""
     hinge_rotmat = rotvec_to_rotmat(batch.hinge_axis[:, None] * object_hinge_rad(objects)[..., None])
     origin = batch.hinge_origin_m[:, None, None]
+    slid_m = (batch.slide_m[:, None] * object_hinge_rad(objects)[..., None])[..., None, :]
     still = batch.points_m[:, None].expand(-1, objects.shape[1], -1, -1)
-    moved = (still - origin) @ hinge_rotmat.transpose(-1, -2) + origin
+    moved = (still - origin) @ hinge_rotmat.transpose(-1, -2) + origin + slid_m
     # Only part 1 of an articulated object moves with the hinge.
     moves = ((batch.part == 1) & batch.articulated[:, None])[:, None, :, None]
     articulated = torch.where(moves, moved, still)

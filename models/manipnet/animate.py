@@ -196,6 +196,7 @@ def clip_of(control: Control, fingers: Mapping[Side, np.ndarray], up: tuple[floa
         object=object_track,
         source_frames=np.arange(n_frames, dtype=np.int32),
         gravity=None if up is None else -np.asarray(up),
+        gravity_note="" if up else "the file of trajectories does not state which axis is up",
         verb=None,
         object_words=control.model.name.replace("_", " "),
         synthetic=synthetic,

@@ -118,7 +118,7 @@ def control_of(trajectories: Trajectories, model: ObjectModel) -> Control:
     """Wrists and object at 30 fps from time 0; an untracked wrist has its pose of the nearest tracked frame."""
     time_s = np.arange(len(trajectories.object)) / FPS
     body_features = trajectories.object.astype(np.float64)
-    hinge = body_features[:, OBJECT_HINGE] if model.is_articulated else None
+    hinge = body_features[:, OBJECT_HINGE] * model.joint_scale if model.is_articulated else None
     wrists: dict[Side, Motion] = {
         side: _wrist(trajectories, side_index, time_s) for side_index, side in enumerate(SIDES)
     }

@@ -43,6 +43,23 @@ class TrackedFrame:
     hinge_rad: Mapping[Side, float] | None = None  # of hinged objects
 
 
+def tracked_frames(control: Control) -> Iterator[TrackedFrame]:
+    """The frames of recorded trajectories, as a tracker delivers them."""
+    time_s = control.object_motion.time_s
+    wrist_poses, object_poses = [control.wrists[side].at(time_s) for side in SIDES], control.object_motion.at(time_s)
+    hinge = None if control.hinge_rad is None else control.hinge_at(time_s)
+    for frame, frame_s in enumerate(time_s.tolist()):
+        wrists: dict[Side, RigidTransform | None] = dict(zip(SIDES, (_at(p, frame) for p in wrist_poses), strict=True))
+        pose, angle = _at(object_poses, frame), None if hinge is None else float(hinge[frame])
+        yield TrackedFrame(
+            frame_s, wrists, dict.fromkeys(SIDES, pose), None if angle is None else dict.fromkeys(SIDES, angle)
+        )
+
+
+def _at(poses: RigidTransform, frame: int) -> RigidTransform:
+    return RigidTransform(poses.rotation[frame], poses.translation[frame])
+
+
 class Sample(NamedTuple):
     """One frame of one body."""
 

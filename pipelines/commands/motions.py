@@ -1,8 +1,7 @@
-"""``hoidata generate``, ``animate`` and ``hands``: motions for a sentence, trajectories, or an object's motion."""
+"""``hoidata generate``, ``animate``, ``stream``, ``hands``: motions for sentences, trajectories, object motions."""
 
 from collections.abc import Mapping
 from math import isfinite
-from os.path import isfile  # returns False for a name that is too long, where Path.is_file raises
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -11,12 +10,22 @@ import typer
 from pipelines.commands.project import current_profile, enter_project, hands_of
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from hoidata.clips.clip import Side
     from pipelines.command_inputs import WrittenFiles
     from pipelines.generation import Models
 
 Out = Annotated[
     Path,
     typer.Option(help="Output folder for motion.npz, motion.glb and index.html.", resolve_path=True, file_okay=False),
+]
+Store = Annotated[
+    Path | None,
+    typer.Option(
+        help="Also write a store of clips, a new folder (docs/export.md).",
+        resolve_path=True,
+    ),
 ]
 Unit = Annotated[str, typer.Option(help="Unit of a mesh file: m, cm, mm, dm or inch. Default: m.")]
 Up = Annotated[
@@ -25,11 +34,29 @@ Up = Annotated[
 MeshHinge = Annotated[
     str,
     typer.Option(
-        help="Hinge of a mesh with two pieces, 'px,py,pz dx,dy,dz': a point on the axis in the file's unit, and the "
-        "axis direction. Default: a rigid object."
+        help="Hinge of a mesh of two pieces, 'px,py,pz dx,dy,dz': a point on the axis (file's unit) and its direction; "
+        "a slide has only a direction."
     ),
 ]
+Moving = Annotated[
+    str,
+    typer.Option(help="What moves: a joint of a URDF, or with --hinge pieces of a mesh (docs/generate.md)."),
+]
 Profile = Annotated[str, typer.Option(help="Profile: embedded, study or own. Default: the one in params.yaml.")]
+
+TracedObject = Annotated[
+    str,
+    typer.Option(
+        "--object", help="The object of the trajectories: a mesh file (OBJ, PLY, STL, GLB) or a dataset's object."
+    ),
+]
+Fingers = Annotated[Literal["left", "right", "both"], typer.Option(help="Hands to animate.")]
+WorldUp = Annotated[
+    str,
+    typer.Option(
+        help="World axis that points up, x, y or z; affects the display and the store. Default: from the file."
+    ),
+]
 
 
 def generate(
@@ -37,10 +64,12 @@ def generate(
     object: Annotated[
         str,
         typer.Option(
-            "--object", help="The object: a mesh file (OBJ, PLY, STL, GLB), or the name of a dataset's object."
+            "--object",
+            help="A mesh file (OBJ, PLY, STL, GLB), a URDF or its folder, or a dataset's object.",
         ),
     ],
     out: Out,
+    store: Store = None,
     seed: Annotated[
         int, typer.Option(help="Random seed; the same seed gives the same bytes.", min=0, max=2**63 - 1)
     ] = 0,
@@ -91,6 +120,7 @@ def generate(
     unit: Unit = "",
     up: Up = "",
     hinge: MeshHinge = "",
+    moving: Moving = "",
     hand_by: Annotated[
         Literal["rules", "similarity"] | None,
         typer.Option(
@@ -111,11 +141,13 @@ def generate(
     force: Annotated[bool, typer.Option("--force", help="Generate even if the sentence has unknown words.")] = False,
 ) -> None:
     """Generate hand-object motions for a sentence and an object; write arrays, an animated GLB and a web page."""
-    mesh = Path(object).resolve() if isfile(object) else None
+    from hoidata.objects.user_mesh import is_object_path
+
+    mesh = Path(object).resolve() if is_object_path(object) else None
     _refuse_ineffective(
         {"--model": models and model, "--profile": models and profile, "--encoder": not models and encoder}
         | {"--hand-by": hand and hand_by}
-        | ({} if mesh or Path(object).suffix else {"--unit": unit, "--up": up, "--hinge": hinge})
+        | ({} if mesh or Path(object).suffix else {"--unit": unit, "--up": up, "--hinge": hinge, "--moving": moving})
     )
     root = enter_project() if models is None else None
     from hoidata.clips.clip import FPS
@@ -138,13 +170,13 @@ def generate(
         mesh or object,
         model=model,
         options=MotionOptions(seed=seed, samples=samples, hand=hand, frames=frames, hand_by=hand_by),
-        mesh=MeshOptions(unit, up, hinge),
+        mesh=MeshOptions(unit, up, hinge, moving),
         sampler=of_sampler,
         sampling=of_sampling,
         force=force,
         **model_source,
     )
-    _print_written(generate_files(request, out))
+    _print_written(generate_files(request, out, store))
 
 
 def _refuse_ineffective(options: Mapping[str, Any]) -> None:
@@ -153,8 +185,8 @@ def _refuse_ineffective(options: Mapping[str, Any]) -> None:
         from hoidata.errors import BadInput
 
         expected = (
-            "--model and --profile in a project, --encoder with --models, --hand-by without --hand, --unit, --up and "
-            "--hinge with an existing mesh file"
+            "--model and --profile in a project, --encoder with --models, --hand-by without --hand, --unit, --up, "
+            "--hinge and --moving with an existing mesh file"
         )
         raise BadInput(", ".join(ineffective), expected, "an option that has no effect here", "omit it")
 
@@ -180,13 +212,9 @@ def animate(
         ),
     ],
     out: Out,
-    object: Annotated[
-        str,
-        typer.Option(
-            "--object", help="The object of the trajectories: a mesh file (OBJ, PLY, STL, GLB) or a dataset's object."
-        ),
-    ] = "",
-    fingers: Annotated[Literal["left", "right", "both"], typer.Option(help="Hands to animate.")] = "both",
+    store: Store = None,
+    object: TracedObject = "",
+    fingers: Fingers = "both",
     frames: Annotated[
         str, typer.Option(help="Frames of a clip to replace, FIRST:STOP such as 30:90. Default: all.")
     ] = "",
@@ -208,10 +236,7 @@ def animate(
             "thumb)."
         ),
     ] = "model",
-    world_up: Annotated[
-        str,
-        typer.Option(help="World axis that points up, x, y or z; affects the display only. Default: from the file."),
-    ] = "",
+    world_up: WorldUp = "",
     unit: Annotated[
         str,
         typer.Option(help="Unit of a mesh file: m, cm, mm, dm or inch. Default: m, or dm with a ManipNet .txt file."),
@@ -230,13 +255,15 @@ def animate(
     start_folder = Path.cwd()
     project = enter_project()
     from hoidata.clips.clip import SIDES
+    from hoidata.objects.user_mesh import is_object_path
     from pipelines.animation import AnimationOptions, animate_files
     from pipelines.command_inputs import MeshOptions
     from pipelines.params import read_params
 
     # Paths are relative to the folder in which the command was typed.
     source, object = (
-        str(start_folder / name) if name and isfile(start_folder / name) else name for name in (source, object)
+        str(start_folder / name) if name and is_object_path(str(start_folder / name)) else name
+        for name in (source, object)
     )
     options = AnimationOptions(
         sides=SIDES if fingers == "both" else (fingers,),
@@ -251,14 +278,60 @@ def animate(
         method=way,
     )
     datasets = tuple(read_params(project)["datasets"])
-    _print_written(animate_files(source, options, profile or current_profile(), datasets, out))
+    _print_written(animate_files(source, options, profile or current_profile(), datasets, out, store))
+
+
+def stream(
+    source: Annotated[
+        str, typer.Argument(metavar="TRAJECTORIES", help="Trajectories of wrists and object (docs/fingers.md).")
+    ],
+    object: TracedObject,
+    out: Out,
+    store: Store = None,
+    fast: Annotated[bool, typer.Option("--fast", help="Do not wait for the times of the frames.")] = False,
+    fingers: Fingers = "both",
+    model: Annotated[str, typer.Option(help="Dataset whose network to use. Default: the first with a network.")] = "",
+    world_up: WorldUp = "",
+) -> None:
+    """Play trajectories through the live finger stream at recorded speed.
+
+    Prints a pose per line: time_s, and axis-angles (15, 3) of each hand. Then writes what `animate` does.
+    """
+    import json
+
+    from hoidata.geometry.rotations import rotmat_to_rotvec
+
+    def show(time_s: float, poses: "Mapping[Side, np.ndarray]") -> None:
+        rotations = {side: rotmat_to_rotvec(pose).round(6).tolist() for side, pose in poses.items()}
+        typer.echo(json.dumps({"time_s": round(time_s, 6), **rotations}))
+
+    start_folder, project = Path.cwd(), enter_project()
+    from hoidata.clips.clip import SIDES
+    from hoidata.objects.user_mesh import is_object_path
+    from pipelines.animation import AnimationOptions, stream_files
+    from pipelines.params import read_params
+
+    options = AnimationOptions(
+        sides=SIDES if fingers == "both" else (fingers,),
+        model=model,
+        object=str(start_folder / object) if is_object_path(str(start_folder / object)) else object,
+        up=world_up,
+    )
+    datasets, source = tuple(read_params(project)["datasets"]), str(start_folder / source)
+    written = stream_files(source, options, current_profile(), datasets, out, store, show, not fast)
+    for line in (*written.verdict, *written.notes, *written.paths):
+        typer.echo(line, err=True)
 
 
 def hands(
     out: Out,
+    store: Store = None,
     object: Annotated[
         str,
-        typer.Argument(metavar="[MESH]", help="A mesh file (OBJ, PLY, STL, GLB), or the name of a dataset's object."),
+        typer.Argument(
+            metavar="[MESH]",
+            help="A mesh file (OBJ, PLY, STL, GLB), a URDF or its folder, or a dataset's object.",
+        ),
     ] = "",
     keyframes: Annotated[
         str, typer.Option(help="The object's motion as keyframes: a .csv or .json file (docs/hands.md).")
@@ -274,11 +347,12 @@ def hands(
     unit: Unit = "",
     up: Up = "",
     hinge: MeshHinge = "",
+    moving: Moving = "",
     hinge_range: Annotated[
         str,
         typer.Option(
-            help="Lowest and highest hinge angle in degrees, such as 0:110; 0 is the mesh as stored. "
-            "Default: not limited, or as recorded for a dataset's object."
+            help="Lowest and highest hinge angle in degrees, or slide in cm, such as 0:110; 0 is the mesh as stored. "
+            "Default: that of the URDF, as recorded for a dataset's object, or not limited."
         ),
     ] = "",
     model: Annotated[str, typer.Option(help="Dataset whose networks to use. Default: the first that has them.")] = "",
@@ -287,16 +361,17 @@ def hands(
     """Generate hand motion for a given object motion; write arrays, an animated GLB per sample and a web page."""
     start_folder = Path.cwd()
     project = enter_project()
+    from hoidata.objects.user_mesh import is_object_path
     from pipelines.command_inputs import MeshOptions
     from pipelines.hands import HandsOptions, hands_files
     from pipelines.params import read_params
 
     options = HandsOptions(
-        object=str(start_folder / object) if object and isfile(start_folder / object) else object,
+        object=str(start_folder / object) if object and is_object_path(str(start_folder / object)) else object,
         keyframes=str(start_folder / keyframes) if keyframes else "",
         clip=clip,
         motion=str(start_folder / motion) if motion else "",
-        mesh=MeshOptions(unit, up, hinge),
+        mesh=MeshOptions(unit, up, hinge, moving),
         hinge_range=hinge_range,
         hand=hand,
         samples=samples,
@@ -305,7 +380,7 @@ def hands(
         model=model,
     )
     datasets = tuple(read_params(project)["datasets"])
-    _print_written(hands_files(options, profile or current_profile(), datasets, out))
+    _print_written(hands_files(options, profile or current_profile(), datasets, out, store))
 
 
 def _print_written(written: "WrittenFiles") -> None:

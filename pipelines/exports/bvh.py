@@ -64,9 +64,8 @@ def _object_motion(track: ObjectTrack) -> tuple[tuple[str, ...], tuple[int, ...]
     translation_m, rotvec = np.asarray(track.translation_m, np.float64), np.asarray(track.rotvec, np.float64)
     if track.model.hinge is None:
         return ("object",), (-1,), translation_m[:, None], Rotation.from_rotvec(rotvec)
-    hinge = track.model.hinge
-    positions_m = np.stack([translation_m, np.broadcast_to(hinge.origin_m, translation_m.shape)], axis=1)
-    rotvecs = np.stack([rotvec, hinge.axis * hinge_of(track)[:, None]], axis=1)
+    part_m, part_rotvec = track.model.hinge.node_motion(hinge_of(track))
+    positions_m, rotvecs = np.stack([translation_m, part_m], axis=1), np.stack([rotvec, part_rotvec], axis=1)
     return ("object", "moving_part"), (-1, 0), positions_m, Rotation.from_rotvec(rotvecs.reshape(-1, 3))
 
 

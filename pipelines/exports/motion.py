@@ -56,7 +56,12 @@ COLUMNS = (
     *_hand_columns("right"),
     Column("object_translation_m", "float32", (3,), "origin of the object frame; world frame, metre"),
     Column("object_quaternion_xyzw", "float32", (4,), "world_from_object rotation, column vectors"),
-    Column("object_hinge_rad", "float32", (), "hinge angle from the mesh as stored, radian; 0 for a rigid object"),
+    Column(
+        "object_hinge_rad",
+        "float32",
+        (),
+        "joint position from the mesh as stored: hinge angle in radian, slide in metre; 0 if rigid",
+    ),
     Column("source_frames", "int32", (), "index in the source file, from 0"),
 )
 CLIP_COLUMNS = (

@@ -3,10 +3,11 @@
 processed/<dataset>/mano/<hands>/<clip>/0/trajectory_keypoints.npz has, per side, wrist, five fingertips (thumb,
 index, middle, ring, pinky) and object as position and quaternion wxyz. task_info.json names the object's mesh. The
 world is rotated so that z is up, as in MuJoCo. The object belongs to the right hand, or to the left one if only that
-is tracked.
+is tracked. SPIDER moves one rigid object per hand, so the parts of a hinged object are two objects: the moving part
+belongs to the hand closer to it, the base to the other hand.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from hoidata.clips.clip import FPS, SIDES, Clip, Side
 from hoidata.files.arrays import write_npz
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.surface_index import surface_index
 from pipelines.exports.motion import ExportedClip, file_name_of
 from pipelines.pages.glb import upright_rotation
 
@@ -29,16 +31,18 @@ def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
     """Write processed/<dataset>/ below ``folder``."""
     for item in clips:
         root = folder / "processed" / file_name_of(item.clip.dataset)
-        mesh = root / "assets" / "objects" / file_name_of(item.clip.object.model.name)
-        if not mesh.exists():
-            mesh.mkdir(parents=True)
-            (mesh / "visual.obj").write_text(_obj(item.clip.object.model))
         embodiment = _embodiment(item.clip)
+        part_of = _part_of_hand(item, embodiment)
+        folders = {
+            side: _write_mesh(root / "assets" / "objects", item.clip.object.model, part_of[side]) for side in part_of
+        }
         task = root / "mano" / embodiment / item.file_name
         (task / "0").mkdir(parents=True)
-        write_npz(task / "0" / "trajectory_keypoints.npz", _keypoints(item, embodiment))
-        owner = "left" if embodiment == "left" else "right"
-        meshes = {f"{side}_object_mesh_dir": str(mesh.relative_to(folder)) if side == owner else None for side in SIDES}
+        write_npz(task / "0" / "trajectory_keypoints.npz", _keypoints(item, embodiment, part_of))
+        meshes = {
+            f"{side}_object_mesh_dir": str(folders[side].relative_to(folder)) if side in folders else None
+            for side in SIDES
+        }
         info = {"task": item.file_name, "dataset_name": item.clip.dataset, "robot_type": "mano", "data_id": 0}
         info |= {"embodiment_type": embodiment, "hand_type": embodiment, "ref_dt": 1 / FPS, **meshes}
         (task / "task_info.json").write_bytes(orjson.dumps(info, option=orjson.OPT_INDENT_2) + b"\n")
@@ -46,13 +50,15 @@ def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
 
 def unsupported(clip: Clip) -> str:
     """The reason why SPIDER cannot represent a clip; empty if it can."""
-    if clip.object.is_articulated:
-        return "SPIDER moves rigid objects only, this one has a hinge"
     if clip.gravity is None:
         return "SPIDER moves objects under gravity, and this clip's is not known"
     if not all(clip.hands[side].valid.all() or not clip.hands[side].valid.any() for side in SIDES):
         return "SPIDER requires all hands in all frames; export the frames in which the hand is tracked"
-    return "" if any(clip.hands[side].valid.any() for side in SIDES) else "no hand is tracked"
+    if not any(clip.hands[side].valid.any() for side in SIDES):
+        return "no hand is tracked"
+    if clip.object.is_articulated and _embodiment(clip) != "bimanual":
+        return "SPIDER moves one rigid object per hand: the parts of a hinged object need both hands"
+    return ""
 
 
 def _embodiment(clip: Clip) -> str:
@@ -60,17 +66,48 @@ def _embodiment(clip: Clip) -> str:
     return "bimanual" if len(tracked) == 2 else tracked[0]
 
 
-def _keypoints(item: ExportedClip, embodiment: str) -> dict[str, np.ndarray]:
+def _part_of_hand(item: ExportedClip, embodiment: str) -> dict[Side, int | None]:
+    """The part of the object that belongs to each hand with an object; None is the whole rigid object."""
+    track = item.clip.object
+    if not track.is_articulated:
+        return {"left" if embodiment == "left" else "right": None}
+    surfaces = surface_index(track.model).filled
+
+    def excess_m(side: Side) -> float:
+        """By how much a hand is farther from the moving part than from the base, mean over the frames."""
+        tips_m = item.joints[side][:, list(TIPS)].astype(np.float64)
+        nearest_m = []
+        for part in (0, 1):
+            world_from_part = track.world_from_object @ track.model.object_from_part(part, track.hinge_rad)
+            positions_m = np.ascontiguousarray((world_from_part.inverse() @ tips_m).reshape(-1, 3))
+            nearest_m.append(surfaces[part].distance_m(positions_m).reshape(-1, len(TIPS)).min(axis=1))
+        return float((nearest_m[1] - nearest_m[0]).mean())
+
+    moving_side = min(SIDES, key=excess_m)
+    return {side: int(side == moving_side) for side in SIDES}
+
+
+def _write_mesh(folder: Path, model: ObjectModel, part: int | None) -> Path:
+    """Write the mesh of an object, or of one part in the frame of the object, once; returns its folder."""
+    name = model.name if part is None else f"{model.name}/{('base', 'moving_part')[part]}"
+    mesh = folder / file_name_of(name)
+    if not mesh.exists():
+        mesh.mkdir(parents=True)
+        (mesh / "visual.obj").write_text(_obj(model, part))
+    return mesh
+
+
+def _keypoints(item: ExportedClip, embodiment: str, part_of: Mapping[Side, int | None]) -> dict[str, np.ndarray]:
     n_frames = item.clip.n_frames
     z_up = Rotation.from_rotvec((np.pi / 2, 0, 0)) * upright_rotation(item.clip.gravity)
     identity = np.broadcast_to(_IDENTITY_POSE, (n_frames, 7))
     arrays: dict[str, np.ndarray] = {}
-    for side in ("right", "left"):
+    sides: tuple[Side, Side] = ("right", "left")
+    for side in sides:
         tracked = embodiment in ("bimanual", side)
         wrist, tips = _hand(item.joints[side], side, z_up) if tracked else (identity, np.stack([identity] * 5, axis=1))
-        has_object = side == ("left" if embodiment == "left" else "right")
         arrays |= {f"qpos_wrist_{side}": wrist, f"qpos_finger_{side}": tips}
-        arrays[f"qpos_obj_{side}"] = _object(item.clip, z_up) if has_object else identity
+        arrays[f"qpos_obj_{side}"] = _object(item.clip, z_up, part_of[side]) if side in part_of else identity
     return {name: np.array(values, np.float64) for name, values in arrays.items()}
 
 
@@ -85,9 +122,10 @@ def _hand(joints_m: np.ndarray, side: Side, z_up: Rotation) -> tuple[np.ndarray,
     return _pose(joints[:, 0], frame), tips
 
 
-def _object(clip: Clip, z_up: Rotation) -> np.ndarray:
-    rotation = z_up * Rotation.from_rotvec(clip.object.rotvec.astype(np.float64))
-    return _pose(z_up.apply(clip.object.translation_m.astype(np.float64)), rotation)
+def _object(clip: Clip, z_up: Rotation, part: int | None) -> np.ndarray:
+    track = clip.object
+    world_from_part = track.world_from_object @ track.model.object_from_part(part or 0, track.hinge_rad)
+    return _pose(z_up.apply(world_from_part.translation), z_up * Rotation.from_matrix(world_from_part.rotation))
 
 
 def _pose(position_m: np.ndarray, rotation: Rotation) -> np.ndarray:
@@ -98,7 +136,11 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def _obj(model: ObjectModel) -> str:
-    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in model.vertices_m]
-    lines += [f"f {a} {b} {c}" for a, b, c in model.faces + 1]
+def _obj(model: ObjectModel, part: int | None) -> str:
+    vertices_m, faces = model.vertices_m, model.faces
+    if part is not None:
+        used, corners = np.unique(model.faces_of(part), return_inverse=True)
+        vertices_m, faces = vertices_m[used], corners.reshape(-1, 3)
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices_m]
+    lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
     return "\n".join(lines) + "\n"

@@ -2,7 +2,7 @@
 
 ``/world`` rotates the clip's world so that gravity is -y. A hand is a mesh with points per frame, which include pose
 correctives and personal shape, and its 21 joints are a point prim. An object is a mesh below a transform per frame; its
-moving part has a second transform about the hinge.
+moving part has a second transform, of its joint.
 """
 
 from collections.abc import Iterable
@@ -85,8 +85,7 @@ def _add_object(stage: Any, path: str, track: ObjectTrack) -> None:
     _part_mesh(stage, f"{path}/base", model.vertices_m, model.faces_of(0), OBJECT_COLOUR)
     if model.hinge is None:
         return
-    rotvec = model.hinge.axis * hinge_of(track)[:, None]
-    _transform(stage, f"{path}/moving_part", np.broadcast_to(model.hinge.origin_m, rotvec.shape), rotvec)
+    _transform(stage, f"{path}/moving_part", *model.hinge.node_motion(hinge_of(track)))
     vertices = model.vertices_m - model.hinge.origin_m
     _part_mesh(stage, f"{path}/moving_part/mesh", vertices, model.faces_of(1), MOVING_PART_COLOUR)
 

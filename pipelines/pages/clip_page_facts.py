@@ -36,7 +36,8 @@ class ClipSeries:
     solid: bool  # the object is a closed solid, so depth is defined
     speed_m_s: np.ndarray  # of the object
     lift_m: np.ndarray | None  # height of the object above its first frame; None without gravity
-    hinge_rad: np.ndarray | None  # None for a rigid object
+    hinge_rad: np.ndarray | None  # as in ``ObjectTrack``; None for a rigid object
+    is_prismatic: bool  # whether it is in metres
 
     def touched_count(self, side: Side) -> np.ndarray:
         """(frame,) number of sampled points that this hand touches."""
@@ -266,6 +267,7 @@ def measure_clip(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> Clip
         speed_m_s=_speed_m_s(centre_m),
         lift_m=None if clip.gravity is None else -(centre_m - centre_m[0]) @ np.asarray(clip.gravity, np.float64),
         hinge_rad=clip.object.hinge_rad,
+        is_prismatic=clip.object.model.hinge is not None and clip.object.model.hinge.is_prismatic,
     )
 
 

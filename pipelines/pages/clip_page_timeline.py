@@ -98,9 +98,10 @@ def _object_charts(series: ClipSeries) -> list[Chart]:
         title = "height of the object above its first frame"
         charts.insert(0, Chart(title, "cm", [Line("object", OBJECT_COLOUR, series.lift_m * 100)], 2))
     if series.hinge_rad is not None:
-        charts.append(
-            Chart("hinge angle", "degrees", [Line("object", OBJECT_COLOUR, np.degrees(series.hinge_rad))], 10)
+        title, unit, factor, least = (
+            ("slide", "cm", 100.0, 1) if series.is_prismatic else ("hinge angle", "degrees", np.degrees(1.0), 10)
         )
+        charts.append(Chart(title, unit, [Line("object", OBJECT_COLOUR, factor * series.hinge_rad)], least))
     return charts
 
 

@@ -272,8 +272,11 @@ def _add_object(
     if model.hinge is None or track.hinge_rad is None:
         return
     part = builder.node(f"{name} moving part", node, translation=np.float32(model.hinge.origin_m).tolist())
-    angles = model.hinge.axis[None] * np.asarray(track.hinge_rad)[:, None]
-    builder.animate(part, "rotation", times, continuous_quaternions(angles))
+    positions_m, angles = model.hinge.node_motion(track.hinge_rad)
+    if model.hinge.is_prismatic:
+        builder.animate(part, "translation", times, positions_m.astype(np.float32))
+    else:
+        builder.animate(part, "rotation", times, continuous_quaternions(angles))
     colour = OTHER_OBJECT_COLOUR if other else MOVING_PART_COLOUR
     _add_part(builder, part, model, model.faces_of(1), 1, colour, contact)
 

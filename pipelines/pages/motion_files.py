@@ -30,12 +30,12 @@ ARRAYS = {
     "template_m": "(S, vertex, 3) personal rest meshes; empty if the rest mesh is that of the hand model",
     "object_rotvec": "(F, 3) axis-angle of world from object",
     "object_translation_m": "(F, 3) world position of the object's origin",
-    "object_hinge_rad": "(F,) hinge angle of an articulated object",
+    "object_hinge_rad": "(F,) hinge angle of an articulated object; metres if its joint is prismatic",
     "object_vertices_m": "(vertex, 3) mesh in the object frame",
     "object_faces": "(face, 3) vertex numbers",
     "object_part": "(vertex,) 1 where the hinge moves it",
     "object_hinge_axis": "(3,) direction of the hinge of an articulated object, in the object frame",
-    "object_hinge_origin_m": "(3,) a point on the hinge",
+    "object_hinge_origin_m": "(3,) a point on the hinge; missing if the joint is prismatic",
 }
 
 
@@ -120,7 +120,8 @@ def mesh_arrays(model: ObjectModel) -> dict[str, np.ndarray]:
     }
     if model.hinge is not None:
         arrays["object_hinge_axis"] = np.asarray(model.hinge.axis, np.float64)
-        arrays["object_hinge_origin_m"] = np.asarray(model.hinge.origin_m, np.float64)
+        if not model.hinge.is_prismatic:
+            arrays["object_hinge_origin_m"] = np.asarray(model.hinge.origin_m, np.float64)
     return arrays
 
 

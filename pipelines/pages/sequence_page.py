@@ -72,7 +72,9 @@ def _described(annotated: AnnotatedStore, clip_id: str) -> _SequenceClip:
 def _timeline(annotated: AnnotatedStore, clips: list[_SequenceClip]) -> str:
     """Bands of clips with their words above; below them hinge angle, height and frames near each hand."""
     last = max(int(item.clip.source_frames[-1]) for item in clips)
-    has_hinge = clips[0].clip.object.hinge_rad is not None
+    hinge = clips[0].clip.object.model.hinge
+    has_hinge = hinge is not None
+    joint_unit = ("slide, cm", 100.0) if hinge and hinge.is_prismatic else ("hinge, degrees", np.degrees(1.0))
 
     def draw(figure: Figure) -> None:
         rows = figure.subplots(3 if has_hinge else 2, 1, sharex=True, height_ratios=[2] * (1 + has_hinge) + [1])
@@ -86,7 +88,7 @@ def _timeline(annotated: AnnotatedStore, clips: list[_SequenceClip]) -> str:
                 transform=rows[0].get_xaxis_transform(),
             )  # fmt: skip
             if (hinge_rad := item.clip.object.hinge_rad) is not None:
-                rows[-2].plot(frames, np.degrees(hinge_rad), color=OBJECT_COLOUR, linewidth=1.4)
+                rows[-2].plot(frames, joint_unit[1] * hinge_rad, color=OBJECT_COLOUR, linewidth=1.4)
             rows[0].plot(frames, _height_cm(item.clip, clips[0].clip), color=OBJECT_COLOUR, linewidth=1.4)
             evidence = annotated.hand_evidence(item.clip.clip_id)
             for line, side in enumerate(SIDES):
@@ -95,7 +97,7 @@ def _timeline(annotated: AnnotatedStore, clips: list[_SequenceClip]) -> str:
                 )
         rows[0].set_ylabel("height, cm")
         if has_hinge:
-            rows[-2].set_ylabel("hinge, degrees")
+            rows[-2].set_ylabel(joint_unit[0])
         near.set_yticks([0.4, 1.4], [f"{side} hand" for side in SIDES])
         near.set_xlabel("frame of the recording")
         near.set_xlim(0, last + 1)

@@ -4,24 +4,28 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
 
+from hoidata.clips.clip import ObjectTrack
 from hoidata.errors import BadInput
 from hoidata.files.arrays import write_npz
 from hoidata.hands import load_embedded_hands
 from hoidata.object_paths import keyframed_path, parse_keyframes
+from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from models.bimart.hands import ContactMeasures
 from pipelines.command_inputs import MeshOptions, ProjectData, stored_object
-from pipelines.hands import HandsOptions, ObjectMotion, chosen_networks, hinge_range, object_motion
+from pipelines.hands import HandsOptions, ObjectMotion, _untouched_fraction, chosen_networks, hinge_range, object_motion
 from pipelines.pages.hands_page import _measures
 from pipelines.pages.motion_files import mesh_arrays, motion_arrays
 from tests.builders.clips import clip_of
 from tests.builders.objects import hinged_box
+from tests.builders.urdf import write_drawer, write_partnet
 
 HANDS = load_embedded_hands()
 REST = "time_s 0 1"
@@ -177,8 +181,44 @@ def test_unusable_input_is_refused_with_a_remedy(laptop, keys, options, message)
     assert message in str(error.value)
 
 
-def test_a_hinge_range_is_read_in_degrees():
-    assert hinge_range("-90:0") == pytest.approx((-np.pi / 2, 0))
+def test_a_hinge_range_is_read_in_degrees_and_a_slide_in_centimetres(tmp_path):
+    drawer = read_user_object(write_drawer(tmp_path)).model
+    assert hinge_range("-90:0", hinged_box()) == pytest.approx((-np.pi / 2, 0))
+    assert hinge_range("0:15", drawer) == pytest.approx((0, 0.15))
+    assert hinge_range("", drawer) is None
+    with pytest.raises(BadInput, match="two slides in cm"):
+        hinge_range("15", drawer)
+
+
+def test_the_limits_of_a_urdf_bound_the_keyframes_and_a_partnet_folder_is_named_as_object(tmp_path, keys):
+    drawer, cabinet = str(write_drawer(tmp_path / "drawer")), str(write_partnet(tmp_path / "4321"))
+    motion = selected(object=drawer, keyframes=keys("time_s,slide_cm 0,0 2,15"))
+    assert motion.track.hinge_rad.max() == pytest.approx(0.15)
+    with pytest.raises(BadInput, match=r"a slide of 0\.0 to 20\.0 cm"):
+        selected(object=drawer, keyframes=keys("time_s,slide_cm 0,0 2,25"))
+    with pytest.raises(BadInput, match=r"joint_0 \(revolute\), joint_1 \(prismatic\)"):
+        selected(object=cabinet, keyframes=keys("time_s,hinge_deg 0,0 2,30"))
+    door = selected(object=cabinet, keyframes=keys("time_s,hinge_deg 0,0 2,30"), mesh=MeshOptions(moving="joint_0"))
+    assert (door.track.model.name, door.track.model.hinge.is_prismatic) == ("4321", False)
+
+
+def test_the_slide_of_a_motion_file_is_read_back(tmp_path, keys):
+    track = selected(object=str(write_drawer(tmp_path / "d")), keyframes=keys("time_s,slide_cm 0,0 2,15")).track
+    write_npz(tmp_path / "motion.npz", motion_arrays(clip_of("a/b/c", track), HANDS) | mesh_arrays(track.model))
+    again = selected(motion=str(tmp_path / "motion.npz")).track
+    expected_m = track.points_in_world(track.model.vertices_m, track.model.part)
+    assert again.points_in_world(again.model.vertices_m, again.model.part) == pytest.approx(expected_m, abs=1e-6)
+
+
+@pytest.mark.parametrize(("distance_m", "expected"), [(0.01, 0.0), (0.05, 1.0)])
+def test_a_moving_part_without_a_hand_near_it_is_found(distance_m, expected):
+    """Points of the base are touched in all frames; only those of the lid count, while it moves."""
+    angle_rad, part = np.array([0, 0, 0.1, 0.2, 0.2], np.float32), np.array([0, 0, 1, 1], np.uint8)
+    clip = clip_of("a/b/c", ObjectTrack(hinged_box(), np.zeros((5, 3)), np.zeros((5, 3)), angle_rad))
+    reached_m = np.full((2, 5, 4), np.inf)
+    reached_m[0, :, :2], reached_m[1, 2:4, 3] = 0.0, distance_m
+    sample = SimpleNamespace(clip=clip, reached_m=reached_m, points=SimpleNamespace(part=part))
+    assert _untouched_fraction(sample) == expected
 
 
 def test_an_open_mesh_is_moved_like_any_other(tmp_path, keys):

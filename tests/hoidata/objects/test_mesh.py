@@ -90,6 +90,18 @@ def test_a_mesh_of_too_many_vertices_or_triangles_is_refused(monkeypatch: pytest
         parse_obj("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n" + "f 1 2 3\n" * 5, "a.obj")
 
 
+@pytest.mark.parametrize("kind", ["stl", "stl_ascii"])
+def test_an_stl_has_one_vertex_per_corner_of_the_solid(tmp_path: Path, kind: str):
+    box = trimesh.creation.box((1, 2, 4))
+    content = box.export(file_type=kind)
+    (tmp_path / "box.stl").write_bytes(content if isinstance(content, bytes) else content.encode())
+    read = load_mesh(tmp_path / "box.stl")
+    assert read.vertices.shape == (8, 3)
+    triangles = [np.sort(mesh.vertices[mesh.faces].reshape(-1, 9), axis=0) for mesh in (read, box)]
+    np.testing.assert_allclose(triangles[0], triangles[1])
+    assert mass_properties(*read).volume_m3 == pytest.approx(8)
+
+
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
 def test_a_ply_keeps_vertex_order(tmp_path: Path, encoding):
     vertices = np.array([[0, 0, 1], [0, 0, 0], [1, 0, 0], [0, 0, 0], [0, 1, 0]], dtype=float)
@@ -145,7 +157,8 @@ BAD = {
     "nan.obj": ("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "finite"),
     "header.ply": ("ply\nformat ascii 1.0\nelement vertex 3\n", "readable"),
     "text.ply": ("hello", "readable"),
-    "mesh.step": ("solid", ".obj or .ply"),
+    "mesh.step": ("solid", ".obj, .ply or .stl"),
+    "corners.stl": ("solid a\nfacet\nouter loop\nvertex 0 0 0\nendloop\nendfacet\nendsolid", "readable"),
 }
 
 

@@ -7,6 +7,7 @@ A reader takes the exported folder and returns, by clip id, the left joints (fra
 import json
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import pandas as pd
@@ -169,4 +170,4 @@ def _of_bvh(path: Path) -> np.ndarray:
 
 
 def _id(path: Path) -> str:
-    return path.stem.replace("__", "/")
+    return unquote(path.stem.replace("__", "/"))

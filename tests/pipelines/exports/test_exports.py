@@ -86,7 +86,7 @@ def test_spider_gets_tips_and_object_with_z_up_and_skips_unsupported_clips(store
     assert (Rotation.from_quat(pose[:, [4, 5, 6, 3]]).inv() * rotation).magnitude().max() < 1e-6
     info = json.loads((path.parents[1] / "task_info.json").read_text())
     assert (folder / info["right_object_mesh_dir"] / "visual.obj").is_file()
-    assert "hinge" in json.loads((folder / "export.json").read_text())["left_out"]["toy/s2/open_1"]
+    assert "all hands in all frames" in json.loads((folder / "export.json").read_text())["left_out"]["toy/s2/open_1"]
 
 
 def test_an_untracked_hand_is_invisible_in_usd(exported):
@@ -240,7 +240,7 @@ def test_unusable_arguments_are_refused(store, tmp_path):
         ("one of croissant, lerobot", {"to": "fbx", "out": tmp_path / "a"}),
         ("a path that does not exist", {"to": "bvh", "out": tmp_path / "there"}),
         ("ids of clips", {"to": "bvh", "out": tmp_path / "a", "clip_ids": ("toy/s9/none",)}),
-        ("has a hinge", {"to": "spider", "out": tmp_path / "a", "clip_ids": ("toy/s2/open_1",)}),
+        ("all hands in all frames", {"to": "spider", "out": tmp_path / "a", "clip_ids": ("toy/s2/open_1",)}),
     ]
     for message, arguments in cases:
         with pytest.raises(BadInput, match=message):
