@@ -28,6 +28,11 @@ FAMILIES = {
     "manipnet": "models.manipnet.family:FINGERS",
     "bimart": "models.bimart.family:BIMART",
     "bimart-unrefined": "models.bimart.family:UNREFINED",
+    "mdm": "models.mdm.family:FAMILY",
+    "imos": "models.imos.family:FAMILY",
+    "imos-true-start": "models.imos.family:TRUE_START",
+    "t2m": "models.t2m.family:FAMILY",
+    "t2m-given-length": "models.t2m.family:GIVEN_LENGTH",
     "nearest-window": "models.bimart.retrieval:NEAREST_WINDOW",
     "nearest-window-refined": "models.bimart.retrieval:NEAREST_REFINED",
     "mean-pose-at-object": "models.bimart.retrieval:OBJECT_MEAN_POSE",
@@ -65,6 +70,11 @@ NETWORKS = {
     "manipnet": "models.manipnet.training:MANIPNET",
     "bimart-contact": "models.bimart.training:CONTACT",
     "bimart-motion": "models.bimart.training:MOTION",
+    "mdm": "models.mdm.family:MDM",
+    "imos": "models.imos.family:IMOS",
+    "t2m-movement": "models.t2m.movement:MOVEMENT",
+    "t2m": "models.t2m.generator:GENERATOR",
+    "t2m-length": "models.t2m.movement:LENGTH",
 }
 
 

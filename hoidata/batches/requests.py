@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from itertools import groupby
 from typing import Any, Self
 
 import numpy as np
@@ -11,6 +12,8 @@ from torch import Tensor
 from hoidata.devices import send
 from hoidata.errors import BadInput
 from hoidata.objects.model import ObjectModel, joint_vectors
+
+MAX_BATCH_SIZE = 64  # requests with the same hand type and similar length, so that there is little padding
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,14 @@ def collate_requests(requests: Sequence[Request]) -> RequestBatch:
     lengths = np.array([request.n_frames for request in requests])
     text = torch.from_numpy(np.stack([request.text for request in requests]))
     return RequestBatch(text=text, **conditions(requests, [request.object for request in requests], lengths))
+
+
+def bucket_by_length(requests: Sequence[Request]) -> list[list[int]]:
+    """Indices of the requests in batches of the same hand type and similar length."""
+    keys = [(tuple(request.active_hands.tolist()), request.n_frames) for request in requests]
+    ordered = sorted(range(len(requests)), key=keys.__getitem__)
+    groups = [list(numbers) for _, numbers in groupby(ordered, key=lambda number: keys[number][0])]
+    return [group[start : start + MAX_BATCH_SIZE] for group in groups for start in range(0, len(group), MAX_BATCH_SIZE)]
 
 
 def conditions(items: Sequence[Any], objects: Sequence[ObjectModel], lengths: np.ndarray) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from hoidata.metrics.registry import METRICS, Metric
 
 _HEAD = """# Metrics
 
-`hoidata evaluate STORE --reference DATASET` compares the clips of any store with recorded clips;
+`hoidata evaluate --store STORE --reference DATASET` compares the clips of any store with recorded clips;
 `hoidata.metrics.evaluate.evaluate_store` does it in Python ([example](../../docs/measure.md)). `python -m
 hoidata.metrics.describe` generates this page from `registry.py` and `feature_metrics.py`.
 

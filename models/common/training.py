@@ -274,7 +274,8 @@ def fit(
     """Run the training steps. Returns the resulting network in evaluation mode, and one log entry per validation."""
     team, network = Team.joined(), objective.network.train()
     trainable = [parameter for parameter in network.parameters() if parameter.requires_grad]
-    optimiser = torch.optim.AdamW(trainable, lr=config.learning_rate, weight_decay=config.weight_decay, fused=True)
+    groups = _parameter_groups(network)
+    optimiser = torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay, fused=True)
     state = State(network, copy.deepcopy(network).eval().requires_grad_(False), optimiser)
     compute_in(network, config.precision)
     if progress:
@@ -309,6 +310,19 @@ def fit(
     if state.best:
         state.ema_network.load_state_dict(state.best)
     return state.ema_network, state.log
+
+
+def _parameter_groups(network: nn.Module) -> list[dict[str, Any]]:
+    """Trainable parameters, with a factor of the learning rate for those that ``network.learning_rate_factors`` names.
+
+    ``learning_rate_factors``, if a network has it, is a sequence of prefixes of parameter names with their factors.
+    """
+    factors = {"": 1.0, **dict(getattr(network, "learning_rate_factors", ()))}
+    groups: dict[str, list[nn.Parameter]] = {prefix: [] for prefix in factors}
+    for name, parameter in network.named_parameters():
+        if parameter.requires_grad:
+            groups[max((prefix for prefix in factors if name.startswith(prefix)), key=len)].append(parameter)
+    return [{"params": groups[prefix], "factor": factor} for prefix, factor in factors.items()]
 
 
 def _add_gradients(
@@ -371,7 +385,7 @@ def _refuse_not_finite(losses: dict[int, Tensor], state: State) -> None:
 def _update(state: State, trainable: list[nn.Parameter], config: TrainingConfig) -> None:
     """One step of the optimiser and of the running average."""
     for group in state.optimiser.param_groups:
-        group["lr"] = config.learning_rate * learning_rate_factor(state.step + 1, config)
+        group["lr"] = config.learning_rate * group["factor"] * learning_rate_factor(state.step + 1, config)
     if config.clip_norm:
         nn.utils.clip_grad_norm_(trainable, config.clip_norm)
     state.optimiser.step()

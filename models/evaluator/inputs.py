@@ -89,7 +89,7 @@ class Examples:
     """The recorded clips of one part of a split, as network inputs and labels."""
 
     ids: list[str]
-    steps: list[np.ndarray]  # per clip (step, 179), ``corrected_input``
+    steps: list[np.ndarray]  # per clip (step, 179), ``corrected_input``; empty if no network reads them
     joints: list[tuple[np.ndarray, np.ndarray]]  # per clip (frame, 42, 3) joints and (frame, 42) presence
     text: np.ndarray  # (clip, 4, 512) features of the sentences
     verbs: list[str | None]
@@ -100,15 +100,15 @@ class Examples:
         return len(self.ids)
 
     @classmethod
-    def of(cls, annotated: AnnotatedStore, split: str) -> "Examples":
-        """The clips of a part that have a verb."""
+    def of(cls, annotated: AnnotatedStore, split: str, joints_only: bool = False) -> "Examples":
+        """The clips of a part that have a verb; joints_only: without ``steps``, which take longest to compute."""
         verbs = {clip_id: verb_of(annotated, clip_id) for clip_id in annotated.ids(split)}
         ids = [clip_id for clip_id, verb in verbs.items() if verb]
         recordings = list(recorded_motions(annotated, ids))
         text = [annotated.text_embedding(clip_id) for clip_id in ids]
         return cls(
             ids,
-            [corrected_input(item.motion, item.sides) for item in recordings],
+            [] if joints_only else [corrected_input(item.motion, item.sides) for item in recordings],
             [joints_and_presence(item.motion, item.sides) for item in recordings],
             np.stack(text) if text else np.zeros((0, 4, 512), np.float32),
             [verbs[clip_id] for clip_id in ids],

@@ -112,7 +112,8 @@ def train_evaluators(
         The content of info.json, or the reason why nothing was written.
     """
     annotated = load_annotated(annotated_root, hands)
-    parts = {split: Examples.of(annotated, split) for split in SPLITS}
+    joints_only = set(settings.networks) == {"paper"}
+    parts = {split: Examples.of(annotated, split, joints_only) for split in SPLITS}
     if (labels := len(parts["train"].trained_verbs)) < 2:
         return f"training clips: {len(parts['train'])}, labels among them: {labels}; nothing to tell apart"
     info: dict[str, Any] = {

@@ -6,7 +6,6 @@ All random numbers of a motion come from its request's seed, so it does not depe
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
-from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +17,7 @@ from hoidata.annotation.encoders import TextEncoder
 from hoidata.annotation.hand_choice import HandChoice, Method, choose_hand
 from hoidata.annotation.vocabulary import Vocabulary
 from hoidata.annotation.wording import parsed_verb
-from hoidata.batches.requests import Request, RequestBatch, collate_requests
+from hoidata.batches.requests import Request, RequestBatch, bucket_by_length, collate_requests
 from hoidata.clips.clip import Clip
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
@@ -40,7 +39,6 @@ from models.text2hoi.refiner_training import REFINER
 NETWORKS = (CONTACT, LENGTH, DIFFUSION, REFINER)
 PAPER_SAMPLER = SamplerConfig("ddpm", TRAIN_STEPS)
 CONTACT_MAP_SAMPLES = 12  # of a contact network with anchors; the medoid is the condition
-MAX_BATCH_SIZE = 64  # requests with the same hand type and similar length, so that there is little padding
 
 
 @dataclass(frozen=True)
@@ -238,14 +236,6 @@ class Text2Hoi:
         if ranges is None:
             return answer
         return replace(answer, rank=ranges.rank(self.verb_of(request), answer.clip, request.points))
-
-
-def bucket_by_length(requests: Sequence[Request]) -> list[list[int]]:
-    """Indices of the requests in batches of the same hand type and similar length."""
-    keys = [(tuple(request.active_hands.tolist()), request.n_frames) for request in requests]
-    ordered = sorted(range(len(requests)), key=keys.__getitem__)
-    groups = [list(numbers) for _, numbers in groupby(ordered, key=lambda number: keys[number][0])]
-    return [group[start : start + MAX_BATCH_SIZE] for group in groups for start in range(0, len(group), MAX_BATCH_SIZE)]
 
 
 def _next_seed(seed: int, attempt: int) -> int:

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from pipelines.commands.project import hands_of_dataset
+from pipelines.stages.base import StagePaths
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from pipelines.expected_orderings import OrderingResult
 
 _FOLDER: Any = {"exists": True, "file_okay": False, "resolve_path": True}
-Store = Annotated[Path, typer.Argument(help="A store of predicted clips with ids <reference id>~<k>.", **_FOLDER)]
+Store = Annotated[Path, typer.Option(help="A store of predicted clips with ids <reference id>~<k>.", **_FOLDER)]
 Reference = Annotated[
     Path, typer.Option(help="The annotated dataset with the recorded clips, such as data/embedded/grab.", **_FOLDER)
 ]
@@ -38,7 +39,7 @@ def evaluate(
     evaluators: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of the trained evaluators, such as evaluators/study/grab. Default: no metrics that need them.",
+            help="Folder of the trained evaluators. Default: that of the reference, such as evaluators/embedded/grab.",
             exists=True,
         ),
     ] = None,
@@ -51,12 +52,9 @@ def evaluate(
     from hoidata.metrics.optional_metrics import select_metrics
     from pipelines.pages.metrics_table import printed_table, unmeasured_lines
     from pipelines.stages.base import jobs
+    from pipelines.stages.evaluate import trained_encoders
 
-    encoders = []
-    if evaluators is not None:
-        from models.evaluator.encoders import load_evaluators
-
-        encoders = load_evaluators(evaluators)
+    encoders = trained_encoders(evaluators or evaluators_of(reference))
     hands, chosen_metrics = hands_of_dataset(reference), select_metrics(filter(None, metrics.split(",")))
     results = evaluate_store(
         store, reference, hands, split=split, metrics=chosen_metrics, encoders=encoders, jobs=jobs(), progress=True
@@ -72,6 +70,12 @@ def evaluate(
         typer.echo(f"skipped: {clips[0]}{others}: {reason}")
     if out is not None:
         write_whole(out, json.dumps(results, indent=2, sort_keys=True, allow_nan=False) + "\n")
+
+
+def evaluators_of(reference: Path) -> Path:
+    """The folder of the evaluators of a dataset ``data/<profile>/<dataset>``; it may not exist."""
+    project = reference.parent.parent.parent
+    return project / StagePaths(reference.parent.name, reference.name).evaluators
 
 
 def table(

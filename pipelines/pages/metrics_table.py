@@ -41,6 +41,10 @@ METHODS = {
     "mean-motion": "the mean of all training motions",
     "mean-pose": "the mean pose of all training clips, in every frame",
     "ground-truth": "the recorded test clip itself",
+    "mdm": "MDM, adapted to hands and objects: diffusion without contact map",
+    "imos": "IMoS, adapted: autoregressive, from the first frames of a retrieved clip",
+    "imos-true-start": "IMoS from four recorded frames",
+    "t2m": "T2M, adapted: autoregressive variational network with its own lengths",
     "manipnet": "our network: fingers for recorded wrists and object",
     "bimart": "our networks: both hands for the recorded object motion",
     "bimart-unrefined": "the same without refinement",
@@ -52,6 +56,15 @@ METHODS = {
     "prompt-retrieval-refined": "the same with contact refinement",
 }
 ZERO = 1e-4  # smaller values are zero: no method wins by them
+# The columns of Text2HOI's Table 1, in its order, as IMoS and ManipNet released them.
+PAPER_TABLE = "The five columns of Text2HOI's Table 1"
+PAPER_COLUMNS = (
+    "accuracy_top3_paper",
+    "fid_paired_paper",
+    "diversity_released_paper",
+    "multimodality_released_paper",
+    "realism_released",
+)
 CONTROLS = "controls"
 NOT_COMPUTED = "-"
 NOT_MEASURED = "not measured"
@@ -186,13 +199,17 @@ class _Files:
 def metrics_tables(folder: str | Path, families: Sequence[str]) -> MetricsTable:
     """The tables of ``folder/<family>.json`` in the given order, then ``folder/controls``.
 
-    A topic has a column for each metric with a value and a line for each unmeasured one. Empty topics are skipped.
+    With an evaluator, the columns of Text2HOI's Table 1 come first. A topic has a column for each metric with a value
+    and a line for each unmeasured one. Empty topics are skipped.
     """
     files = _read_files(Path(folder), families)
     shown = [metric for metric in ALL_METRICS if any(files.has(family, metric) for family in files.contents)]
     never = [metric for metric in ALL_METRICS if metric not in shown and _reasons(metric, files)]
     titles = dict.fromkeys(metric.topic for metric in ALL_METRICS if metric in shown or metric in never)
     topics = [_topic(title, _of_topic(title, shown), _of_topic(title, never), files) for title in titles]
+    if any(metric.name == PAPER_COLUMNS[0] for metric in shown):
+        by_name = {metric.name: metric for metric in ALL_METRICS}
+        topics.insert(0, _topic(PAPER_TABLE, [by_name[name] for name in PAPER_COLUMNS], [], files))
     return MetricsTable([_method(family, files, shown) for family in files.contents], topics)
 
 

@@ -86,7 +86,7 @@ def _measured(paths: StagePaths, settings: EvaluateSettings) -> dict[str, Any]:
         paths.data,
         load_hands(paths.profile),
         metrics=select_metrics(settings.metrics),
-        encoders=_encoders(paths.evaluators),
+        encoders=trained_encoders(paths.evaluators),
         jobs=jobs(),
         progress=True,
     )
@@ -101,7 +101,7 @@ def _with_reasons(left_out: list[dict[str, str]], path: Path) -> list[dict[str, 
     return [{**item, "reason": reasons.get(item["clip_id"], item["reason"])} for item in left_out]
 
 
-def _encoders(folder: Path) -> list["MotionEvaluator"]:
+def trained_encoders(folder: Path) -> list["MotionEvaluator"]:
     """The networks of the stage evaluator; empty, without importing torch, if that stage is off."""
     if not (folder / "info.json").is_file():
         return []

@@ -9,6 +9,9 @@ from hoidata.settings import check_keys
 OPTIONAL_FAMILIES = {
     "manipnet": ("manipnet",),
     "bimart": ("bimart", "bimart-unrefined", "nearest-window", "mean-pose-at-object"),
+    "mdm": ("mdm",),
+    "imos": ("imos", "imos-true-start"),
+    "t2m": ("t2m", "t2m-given-length"),
 }
 KEY = "family_datasets"
 

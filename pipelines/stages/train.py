@@ -17,7 +17,14 @@ from pipelines.lineage.provenance import build_provenance
 from pipelines.params import merge_settings, read_file, read_params
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, write_empty
 
-SENTENCE_READERS = ("contact", "length", "diffusion")  # networks that read sentence features
+SENTENCE_READERS = (
+    "contact",
+    "length",
+    "diffusion",
+    "mdm",
+    "imos",
+    "t2m-length",
+)  # networks that read sentence features
 
 
 @dataclass(frozen=True)

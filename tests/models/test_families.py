@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from hoidata.batches.dataset import ClipSample, HoiDataset, load_sample
-from hoidata.batches.requests import Sentence
+from hoidata.batches.requests import MAX_BATCH_SIZE, Sentence, bucket_by_length
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.contact.maps import f1_score
 from hoidata.errors import BadInput
@@ -28,7 +28,7 @@ from models.common.predicting import PredictionConfig, ReportsContact, requests_
 from models.registry import family_names, load_family, load_network
 from models.text2hoi.contact_training import best_threshold, mean_f1
 from models.text2hoi.family import OtherPrompt, other_prompts
-from models.text2hoi.sampler import MAX_BATCH_SIZE, Text2Hoi, bucket_by_length
+from models.text2hoi.sampler import Text2Hoi
 from tests.models.toy import FAST
 
 HANDS = load_embedded_hands()

@@ -67,6 +67,7 @@ def make_small(folder: Path) -> None:
     params["annotate"]["encoder"] = "hash"
     params["train"]["small"] |= TINY
     params["sample"] |= TINY_SAMPLE
+    params["profiles"]["embedded"]["evaluator"]["most_steps"] = 2
     write_params(folder, params)
 
 

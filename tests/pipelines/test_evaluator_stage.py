@@ -44,7 +44,8 @@ def project(tmp_path, monkeypatch) -> Path:
 
 def choose(project: Path, **settings) -> None:
     params = yaml.safe_load((project / "params.yaml").read_text())
-    (project / "params.yaml").write_text(yaml.safe_dump({**params, "families": ["text2hoi"], "evaluator": settings}))
+    params["profiles"]["embedded"]["evaluator"] = settings
+    (project / "params.yaml").write_text(yaml.safe_dump({**params, "families": ["text2hoi"]}))
 
 
 def test_off_it_writes_the_reason_without_loading_torch(project):
@@ -93,8 +94,7 @@ def stopped_project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A project whose trainings are killed as soon as they have begun."""
     monkeypatch.chdir(tmp_path)
     for name in ("dvc.yaml", "params.yaml"):
-        text = (PROJECT / name).read_text()
-        (tmp_path / name).write_text(text.replace("evaluator: {}", "evaluator: {networks: [paper]}"))
+        (tmp_path / name).write_text((PROJECT / name).read_text())
     for name in ("models", "pipelines", "manifests"):
         (tmp_path / name).symlink_to(PROJECT / name)
     monkeypatch.setattr("models.common.training.train_network", end)

@@ -116,13 +116,14 @@ def test_the_graph_names_no_dataset_and_no_raw_data():
 
 def test_a_family_that_is_off_has_no_stage_and_one_dataset_turns_it_on(graph, project, project_tools):
     assert len(graph) <= 80
-    assert [name for name in graph if name.split("/")[1:2] in (["bimart"], ["manipnet"])] == []
+    assert [name for name in graph if name.split("/")[1:2] in ([name] for name in OPTIONAL_FAMILIES)] == []
     params = yaml.safe_load((project / "params.yaml").read_text())
     params["family_datasets"] = {name: ["arctic"] for name in OPTIONAL_FAMILIES}
     project_tools.write_params(project, params)
     added = {out for name, stage in read_graph(project).items() if name not in graph for out in stage.outs}
     sampled = {f"samples/embedded/arctic/{name}" for names in OPTIONAL_FAMILIES.values() for name in names}
-    trained = {f"checkpoints/embedded/arctic/{name}" for name in ("manipnet", "bimart-contact", "bimart-motion")}
+    networks = "manipnet", "bimart-contact", "bimart-motion", "mdm", "imos", "t2m-movement", "t2m", "t2m-length"
+    trained = {f"checkpoints/embedded/arctic/{name}" for name in networks}
     assert added == sampled | trained | {"samples/embedded/arctic/controls-bimart"}
 
 

@@ -10,6 +10,7 @@ from hoidata.errors import BadInput
 from hoidata.metrics.registry import metric
 from models.registry import family_names
 from pipelines.pages.metrics_table import (
+    ALL_METRICS,
     METHODS,
     NOT_COMPUTED,
     OTHER_EVALUATOR,
@@ -100,6 +101,18 @@ def test_lines_are_families_then_controls_and_columns_are_measured_metrics(folde
     assert methods["absent"].empty == "not evaluated"
     assert methods["ours"].note == "16 motions of 2 clips, 1 skipped"
     assert methods["ours"].diagnostics == [("length mae frames", "10.2")]
+
+
+def test_with_an_evaluator_the_five_columns_of_the_paper_come_first(folder):
+    columns = ["accuracy_top3_paper", "fid_paired_paper", "diversity_released_paper", "multimodality_released_paper"]
+    columns.append("realism_released")
+    values = {name: 0.1 * number for number, name in enumerate(columns, 1)}
+    (folder / "ours.json").write_text(written(FIGURES["ours"] | values))
+    table, titles = table_of(folder), {metric.name: metric.title for metric in ALL_METRICS}
+    assert "Table 1" in table.topics[0].title
+    assert [column[0] for column in table.topics[0].columns] == [titles[name] for name in columns]
+    number_of_ours = [method.family for method in table.methods].index("ours")
+    assert [cell.text for cell in table.topics[0].cells[number_of_ours]] == [number(x) for x in values.values()]
 
 
 def test_the_best_family_is_marked_and_one_worse_than_retrieval_is_named(folder):

@@ -1,0 +1,1 @@
+"""MDM (Tevet et al. 2023), adapted to two hands and an object."""
