@@ -177,14 +177,14 @@ def _common_axis(rotvec_rad: np.ndarray) -> np.ndarray | None:
 
 
 def _csv_rows(text: str, source: str) -> list[dict[str, object]]:
-    table = [row for row in csv.reader(io.StringIO(text)) if row and not row[0].lstrip().startswith("#")]
+    table = [cells for cells in csv.reader(io.StringIO(text)) if cells and not cells[0].lstrip().startswith("#")]
     names = [name.strip() for name in table[0]] if table else []
     if len(set(names)) < len(names):
         raise BadInput(source, "a header with each column once", ", ".join(names)[:200], "correct the header")
-    for number, row in enumerate(table[1:], 1):
-        if len(row) != len(names):
-            raise BadInput(f"{source}: key {number}", f"{len(names)} numbers", f"{len(row)}", "correct the row")
-    return [dict(zip(names, row, strict=True)) for row in table[1:]]
+    for number, cells in enumerate(table[1:], 1):
+        if len(cells) != len(names):
+            raise BadInput(f"{source}: key {number}", f"{len(names)} numbers", f"{len(cells)}", "correct the row")
+    return [dict(zip(names, cells, strict=True)) for cells in table[1:]]
 
 
 def _json_rows(text: str, source: str) -> list[dict[str, object]]:
