@@ -24,7 +24,7 @@ from hoidata.surface.contact import HandInObjectFrame, deepest_m, hand_in_object
 GAP_M = 0.01  # between skin and surface: a larger gap is visible
 DEEP_M = 0.02  # a finger's thickness
 THROUGH_DEG = 120.0  # between the normals at which a finger enters and leaves: it passes through, not over an edge
-LIFTED_M = 0.02  # above the start: the object is in the air
+FLOATING_M = 0.02  # above the start: the object is in the air
 MOVING_M_S = 0.05  # of the object's fastest point
 MIN_FRAMES = 3  # a tenth of a second; a shorter fault is not visible
 STILL_M = 0.01  # an object of which no point moves farther does not move
@@ -137,7 +137,7 @@ def _carries(clip: Clip, gap_m: Mapping[Side, np.ndarray]) -> Check:
     speed_m_s = np.linalg.norm(np.diff(displaced_m, axis=0), axis=2).max(axis=1, initial=0.0) * FPS
     needs_hand = np.append(speed_m_s, 0.0) > MOVING_M_S
     if clip.gravity is not None:
-        needs_hand |= (displaced_m - displaced_m[0]).mean(axis=1) @ -np.asarray(clip.gravity, np.float64) > LIFTED_M
+        needs_hand |= (displaced_m - displaced_m[0]).mean(axis=1) @ -np.asarray(clip.gravity, np.float64) > FLOATING_M
     if not needs_hand.any():
         return Check("carries", None, "the object neither moves nor is in the air")
     nearest_m = np.min([*gap_m.values(), np.full(clip.n_frames, np.inf)], axis=0)

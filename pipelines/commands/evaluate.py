@@ -10,7 +10,6 @@ import typer
 from rich.console import Console
 
 from pipelines.commands.project import hands_of_dataset
-from pipelines.stages.base import StagePaths
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -74,6 +73,8 @@ def evaluate(
 
 def evaluators_of(reference: Path) -> Path:
     """The folder of the evaluators of a dataset ``data/<profile>/<dataset>``; it may not exist."""
+    from pipelines.stages.base import StagePaths
+
     project = reference.parent.parent.parent
     return project / StagePaths(reference.parent.name, reference.name).evaluators
 

@@ -167,8 +167,8 @@ def test_the_evaluator_stops_at_clips_with_numbers_that_are_not_finite(
     """Otherwise it would run all epochs and return its initial weights."""
     of = Examples.of
 
-    def corrupted(annotated: AnnotatedStore, split: str) -> Examples:
-        examples = of(annotated, split)
+    def corrupted(annotated: AnnotatedStore, split: str, joints_only: bool) -> Examples:
+        examples = of(annotated, split, joints_only)
         steps = [np.full_like(array, np.nan) if split == subset else array for array in examples.steps]
         return replace(examples, steps=steps)
 

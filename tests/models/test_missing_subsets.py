@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 from hoidata.batches.dataset import HoiDataset
 from hoidata.hands import load_embedded_hands
 from hoidata.store.annotated import AnnotatedStore, load_annotated
-from models.bimart.family import NO_OTHER, BimArtSampler
+from models.bimart.family import NO_OTHER, BimArtSampler, Change
 from models.common.checkpoints import load_checkpoint
 from models.common.corpus import Corpus
 from models.common.family import Skipped, Sources
@@ -168,8 +168,12 @@ def test_bimart_gets_another_object_only_if_there_is_one(tmp_path: Path) -> None
         for sample in HoiDataset(store, "test", crop="start")
     }
     box, notebook = requests[TOY_MOTIONS[0].model.name], requests[TOY_MOTIONS[2].model.name]
+
+    def sampler(change: Change) -> BimArtSampler:
+        return BimArtSampler(None, HANDS, synthetic=True, change=change, annotated=store)  # type: ignore[arg-type]
+
     left_out = {
-        change: [BimArtSampler(None, HANDS, None, True, change, store)._why_not(one) for one in (box, notebook)]  # type: ignore[arg-type]
+        change: [sampler(change)._why_not(one) for one in (box, notebook)]
         for change in ("other object", "other path", "none")
     }
     assert left_out == {
