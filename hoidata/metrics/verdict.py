@@ -23,7 +23,7 @@ from hoidata.surface.contact import HandInObjectFrame, deepest_m, hand_in_object
 
 GAP_M = 0.01  # between skin and surface: a larger gap is visible
 DEEP_M = 0.02  # a finger's thickness
-THROUGH_DEG = 120.0  # between the normals at which a finger enters and leaves: it passes through, not over an edge
+THROUGH_DEG = 120.0  # between the normals where a finger or palm enters and leaves: not over an edge
 FLOATING_M = 0.02  # above the start: the object is in the air
 MOVING_M_S = 0.05  # of the object's fastest point
 MIN_FRAMES = 3  # a tenth of a second; a shorter fault is not visible
@@ -32,7 +32,8 @@ TILT_DEG = 20.0  # an object that leans more does not stand upright
 ALIKE = 0.03  # of the size: an object is the same shape in two rotations if its surfaces differ by less
 MOVES = {"path_m": 0.05, "hinge_max_deg": 10.0}  # of the mean training clip of a verb that moves its object
 MAX_VERTICES = 500  # of the object that are compared
-FINGERS = np.array([[3 * finger + 1, 3 * finger + 2, 3 * finger + 3] for finger in range(5)])  # joints, knuckle first
+# Joints of each finger: wrist, knuckle, and the two after it. The line of a palm goes from the wrist to the knuckles.
+FINGERS = np.array([[0, 3 * finger + 1, 3 * finger + 2, 3 * finger + 3] for finger in range(5)])
 TIPS = np.array([16, 17, 18, 19, 20])  # of the same fingers: index, middle, pinky, ring, thumb
 UNKNOWN_UP = Unmeasured("it is not known which side of the object is up")
 GIVEN_MOTION = Unmeasured("the object's motion was given, without a verb")
@@ -156,7 +157,7 @@ def _does_not_pierce(
     for side, hand in placed.items():
         through = _pierced(clip, side, hands, hand, index)
         n_fingers = int(through.any(axis=0).sum())
-        texts.append(f"{side} hand: {n_fingers} finger{'s' * (n_fingers != 1)} through the object")
+        texts.append(f"{side} hand: {n_fingers} of 5 lines from wrist to fingertip through the object")
         deep = np.zeros(clip.n_frames, bool)
         if index.is_solid:
             depth_m = np.nan_to_num(deepest_m(hand, index))
@@ -165,17 +166,17 @@ def _does_not_pierce(
         frames = int((deep | through.any(axis=1)).sum())
         texts[-1] += f", too deep in {frames} frames"
         worst = max(worst, frames)
-    limit = f"a finger through, or deeper than {100 * DEEP_M:.0f} cm, in at most {MIN_FRAMES - 1} frames"
+    limit = f"a line through, or deeper than {100 * DEEP_M:.0f} cm, in at most {MIN_FRAMES - 1} frames"
     without = "" if index.is_solid else "; depth is not measured, because the mesh encloses no solid"
     return Check("does not pierce", worst < MIN_FRAMES, f"{'; '.join(texts)} ({limit}){without}")
 
 
 def _pierced(clip: Clip, side: Side, hands: HandPair, hand: HandInObjectFrame, index: SurfaceIndex) -> np.ndarray:
-    """(frame, finger) bool: the centre line from knuckle to tip enters the surface and leaves it on the other side."""
+    """(frame, finger) bool: the centre line from wrist to tip enters the surface and leaves it on the other side."""
     track, frames = clip.object, hand.frames
     joints_m = track.world_from_object.inverse() @ track_joints(clip.hands[side], hands[side]).astype(np.float64)
     joints_m = joints_m[frames]
-    line_m = np.concatenate([joints_m[:, FINGERS], joints_m[:, TIPS][:, :, None]], axis=2)  # (frame, finger, 4, 3)
+    line_m = np.concatenate([joints_m[:, FINGERS], joints_m[:, TIPS][:, :, None]], axis=2)  # (frame, finger, 5, 3)
     pierced = np.zeros(line_m.shape[:2], bool)
     for part, surface in index.filled.items():
         part_from_object = track.model.object_from_part(part, hand.hinge_rad).inverse()
