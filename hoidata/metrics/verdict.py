@@ -207,7 +207,7 @@ def _first_crossing(surface: PartSurface, line_m: np.ndarray) -> tuple[np.ndarra
         facing = np.full(len(lines), EITHER)
         first_hits(surface.tree, np.ascontiguousarray(start_m), direction, length_m, facing, distance_m)
         new = np.isfinite(distance_m) & ~hit
-        position_m[new] = (start_m + distance_m[:, None] * direction)[new]
+        position_m[new] = start_m[new] + distance_m[new, None] * direction[new]
         hit |= new
     return position_m, hit
 

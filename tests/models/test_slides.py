@@ -107,7 +107,11 @@ def test_bimarts_basis_points_have_the_nearest_points_of_the_moved_tray(nearest,
         if nearest == "vertex":
             distance_m = np.linalg.norm(tray.vertices[:, None] - bps.points_m, axis=2).min(axis=0)
         else:
-            distance_m = np.abs(trimesh.proximity.closest_point(tray, bps.points_m)[1])
+            # Every triangle for every point: trimesh's search needs rtree.
+            corners = np.repeat(tray.triangles[None], len(bps.points_m), 0).reshape(-1, 3, 3)
+            points_m = np.repeat(bps.points_m, len(tray.faces), 0)
+            closest_m = trimesh.triangles.closest_point(corners, points_m)
+            distance_m = np.linalg.norm(closest_m - points_m, axis=1).reshape(len(bps.points_m), -1).min(axis=1)
         found_m = np.linalg.norm(result.point_m[frame, :16] - bps.points_m, axis=1)
         np.testing.assert_allclose(found_m, distance_m, atol=1e-5)
 
