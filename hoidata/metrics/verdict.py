@@ -63,17 +63,17 @@ class RequestedVerb:
 
 
 def requested_verb(
-    verb: str | None, known: Collection[str], ranges: VerbRanges | None, clip: Clip, points: ObjectPoints
+    verb: str | None, trained_verbs: Collection[str], ranges: VerbRanges | None, clip: Clip, points: ObjectPoints
 ) -> RequestedVerb | Unmeasured:
     """The verb that a motion must show, or why it cannot be checked.
 
     Args:
-        known: the verbs of the training clips.
+        trained_verbs: those of the training clips.
         ranges: of the training clips; None if the checkpoint has none.
     """
     if ranges is None:
         return Unmeasured("the checkpoint has no ranges of its training clips")
-    if verb is None or verb not in known:
+    if verb is None or verb not in trained_verbs:
         return Unmeasured("the sentence has no verb of the training clips")
     return RequestedVerb(verb, ranges, ranges.numbers(clip, points))
 

@@ -142,11 +142,11 @@ class Generator:
         """
         wording = understood_words(text, self.vocabulary, lambda: self.encoder, force=True)
         hand, cloud = self._hand(text, options), sample_points(object, self.points)
-        turn = np.eye(3, dtype=np.float32) if in_training else training_from_z_up(self.object_ups)
+        rotation = np.eye(3, dtype=np.float32) if in_training else training_from_z_up(self.object_ups)
         first = Request(
             motion_id=f"generated/{object.name}",
-            object=turned(object, turn),
-            points=ObjectPoints(cloud.points_m @ turn.T, cloud.normals @ turn.T, cloud.part),
+            object=turned(object, rotation),
+            points=ObjectPoints(cloud.points_m @ rotation.T, cloud.normals @ rotation.T, cloud.part),
             text=self.encoder.encode([wording.text])[0],
             sentence=Sentence(wording.text, wording.verb, wording.noun),
             active_hands=np.array([hand.hand in (side, "both") for side in SIDES]),
@@ -163,7 +163,9 @@ class Generator:
             evidence = self._evidence(request, answer, hand, options, object_words or wording.noun)
             clip, coarse = answer.clip, motion_clip(request, answer.coarse, answer.object, evidence["synthetic"])
             if not in_training:
-                clip, coarse = (closed_as_stored(turned_back(one, object, turn), self.hands) for one in (clip, coarse))
+                clip, coarse = (
+                    closed_as_stored(turned_back(one, object, rotation), self.hands) for one in (clip, coarse)
+                )
             checks = self._verdict(clip, wording.verb, cloud, in_training)
             motions.append(GeneratedMotion(clip, coarse, answer.touched.numpy(), cloud, evidence, checks))
         return motions

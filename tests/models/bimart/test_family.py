@@ -172,8 +172,8 @@ def test_the_given_shape_is_kept_and_a_fitted_one_is_that_of_the_keypoints(
     sampler = BimArtSampler.load(sources, "none")
     (motion,) = sampler.sample_motions([request])
     side = SIDES[int(np.flatnonzero(request.active_hands)[0])]
-    given = replace(sampler, fits_shape=False).clip(request, motion).hands[side]
-    np.testing.assert_array_equal(given.betas, np.full((1, 10), 0.5, np.float32))
+    kept = replace(sampler, fits_shape=False).clip(request, motion).hands[side]
+    np.testing.assert_array_equal(kept.betas, np.full((1, 10), 0.5, np.float32))
     fitted = sampler.clip(request, motion).hands[side]
     other = sampler.clip(replace(request, betas=np.zeros((2, 10), np.float32)), motion).hands[side]
     np.testing.assert_array_equal(fitted.betas, other.betas)
