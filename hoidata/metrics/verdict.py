@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hoidata.actions.action import Actions
+from hoidata.actions.action import Actions, Limits
 from hoidata.batches.requests import ObjectPoints
 from hoidata.clips.clip import FPS, SIDES, Clip, Side
 from hoidata.hands import HandPair, track_joints
 from hoidata.metrics.unmeasured import NO_GRAVITY, Unmeasured
-from hoidata.metrics.verb_ranges import VerbRanges, up_in_object
+from hoidata.metrics.verb_ranges import SLIP, VerbRanges, up_in_object
 from hoidata.objects.rays import EITHER, first_hits
 from hoidata.objects.surface_index import PartSurface, SurfaceIndex, surface_index
 from hoidata.surface.contact import HandInObjectFrame, deepest_m, hand_in_object_frame
@@ -31,6 +31,7 @@ STILL_M = 0.01  # an object of which no point moves farther does not move
 TILT_DEG = 20.0  # an object that leans more does not stand upright
 ALIKE = 0.03  # of the size: an object is the same shape in two rotations if its surfaces differ by less
 MOVES = {"path_m": 0.05, "hinge_max_deg": 10.0}  # of the mean training clip of a verb that moves its object
+REVERSALS = "reversals_per_s"
 MAX_VERTICES = 500  # of the object that are compared
 # Joints of each finger: wrist, knuckle, and the two after it. The line of a palm goes from the wrist to the knuckles.
 FINGERS = np.array([[0, 3 * finger + 1, 3 * finger + 2, 3 * finger + 3] for finger in range(5)])
@@ -250,12 +251,18 @@ def _does_the_verb(clip: Clip, requested: RequestedVerb | Unmeasured) -> Check:
         return Check(name, False, f"{words} (at least {100 * STILL_M:.0f} cm)")
     if not actions.usual.get(verb):
         return Check(name, None, f"training had too few clips of {verb!r} for usual ranges")
-    if visible := actions.visibly_unusual(verb, numbers):
+    if visible := actions.visibly_unusual(verb, _without_quality(actions.usual[verb], numbers)):
         moved_as = actions.nearest_verb(numbers)
         other = f", more like {moved_as!r}" if requested.ranges.is_other(verb, moved_as) else ""
         return Check(name, False, f"unlike {verb!r} in training{other}: {', '.join(visible)}")
     n_measures = len(actions.usual[verb])
     return Check(name, True, f"{n_measures} measures of motion are in or near their range of the training clips")
+
+
+def _without_quality(usual: Limits, numbers: Mapping[str, float]) -> dict[str, float]:
+    """Measures of the verb: hands that slip and an object that trembles still do it, unless it shakes too little."""
+    most_reversals = usual.get(REVERSALS, (0.0, np.inf))[1]
+    return {**numbers, SLIP: 0.0, REVERSALS: min(numbers[REVERSALS], most_reversals)}
 
 
 def _moves_its_object(actions: Actions, verb: str) -> bool:

@@ -111,6 +111,21 @@ def test_an_object_that_stands_still_fails_if_the_verb_moves_it(ranges: VerbRang
     assert "no point of it moves farther" in checks_of(trembling, ranges)["does the verb"].words
 
 
+def test_trembling_and_slipping_do_not_count_against_the_verb_but_a_shake_must_shake(ranges: VerbRanges) -> None:
+    tremble_m = 0.01 * np.sin(np.arange(FRAMES) * np.pi / 3)
+    clip = lift(rise_m=RISE + tremble_m, hand_rise_m=RISE)
+    bounds = {"slip_cm_s": (0.0, 1.0), "path_m": (0.1, 2.0)}
+    for verb, least, most, passes in (
+        ("lift", 0.0, 0.5, True),
+        ("shake", 1.0, 2.0, True),
+        ("shake", 20.0, 30.0, False),
+    ):
+        usual = {verb: bounds | {"reversals_per_s": (least, most)}}
+        check = checks_of(clip, replace(ranges, actions=replace(ranges.actions, usual=usual)), verb)["does the verb"]
+        assert check.passed is passes, check.words
+    assert check.words.startswith("unlike 'shake' in training: turns back ")
+
+
 @pytest.mark.parametrize("gap_m", [0.008, 0.012, 0.3])
 def test_a_hand_without_contact_is_reported_from_one_centimetre(gap_m: float) -> None:
     check = checks_of(lift(-gap_m))["touches"]
