@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.actions.action import Actions, Limits
 from hoidata.batches.requests import ObjectPoints
-from hoidata.clips.clip import FPS, SIDES, Clip, Side
+from hoidata.clips.clip import SIDES, Clip, Side
+from hoidata.geometry.intervals import runs
 from hoidata.hands import HandPair, track_joints
 from hoidata.metrics.unmeasured import NO_GRAVITY, Unmeasured
 from hoidata.metrics.verb_ranges import SLIP, VerbRanges, up_in_object
@@ -24,8 +25,7 @@ from hoidata.surface.contact import HandInObjectFrame, deepest_m, hand_in_object
 GAP_M = 0.01  # between skin and surface: a larger gap is visible
 DEEP_M = 0.02  # a finger's thickness
 THROUGH_DEG = 120.0  # between the normals where a finger or palm enters and leaves: not over an edge
-FLOATING_M = 0.02  # above the start: the object is in the air
-MOVING_M_S = 0.05  # of the object's fastest point
+TRAVEL_M = 0.02  # an object this far above its start is in the air; one that goes this far without a hand is seen to
 MIN_FRAMES = 3  # a tenth of a second; a shorter fault is not visible
 STILL_M = 0.01  # an object of which no point moves farther does not move
 TILT_DEG = 20.0  # an object that leans more does not stand upright
@@ -134,19 +134,26 @@ def _touches(gap_m: Mapping[Side, np.ndarray]) -> Check:
 
 
 def _carries(clip: Clip, gap_m: Mapping[Side, np.ndarray]) -> Check:
-    """A hand touches the object in the frames in which it is in the air or moves."""
-    displaced_m = _vertex_paths_m(clip)
-    speed_m_s = np.linalg.norm(np.diff(displaced_m, axis=0), axis=2).max(axis=1, initial=0.0) * FPS
-    needs_hand = np.append(speed_m_s, 0.0) > MOVING_M_S
+    """Without a hand at it the object neither travels nor is in the air; a tremble in place is not visible."""
+    paths_m = _vertex_paths_m(clip)
+    in_air = np.zeros(clip.n_frames, bool)
     if clip.gravity is not None:
-        needs_hand |= (displaced_m - displaced_m[0]).mean(axis=1) @ -np.asarray(clip.gravity, np.float64) > FLOATING_M
-    if not needs_hand.any():
+        in_air = (paths_m - paths_m[0]).mean(axis=1) @ -np.asarray(clip.gravity, np.float64) > TRAVEL_M
+    if not in_air.any() and _travel_m(paths_m) <= TRAVEL_M:
         return Check("carries", None, "the object neither moves nor is in the air")
-    nearest_m = np.min([*gap_m.values(), np.full(clip.n_frames, np.inf)], axis=0)
-    alone = int((needs_hand & (nearest_m > GAP_M)).sum())
-    words = f"no hand within {100 * GAP_M:.0f} cm in {alone} of the {needs_hand.sum()} frames in which the object moves"
-    words += " or is in the air" if clip.gravity is not None else ""
-    return Check("carries", alone < MIN_FRAMES, f"{words} (at most {MIN_FRAMES - 1})")
+    alone = np.min([*gap_m.values(), np.full(clip.n_frames, np.inf)], axis=0) > GAP_M
+    travel_m = max((_travel_m(paths_m[first : stop + 1]) for first, stop in runs(alone)), default=0.0)
+    frames = int((alone & in_air).sum())
+    words = f"without a hand within {100 * GAP_M:.0f} cm the object moves {100 * travel_m:.1f} cm"
+    words += f" (at most {100 * TRAVEL_M:.0f} cm)"
+    if clip.gravity is not None:
+        words += f" and is in the air in {frames} frames (at most {MIN_FRAMES - 1})"
+    return Check("carries", travel_m <= TRAVEL_M and frames < MIN_FRAMES, words)
+
+
+def _travel_m(paths_m: np.ndarray) -> float:
+    """The farthest that a vertex of (frame, vertex, 3) gets from its first position, metres."""
+    return float(np.linalg.norm(paths_m - paths_m[0], axis=2).max())
 
 
 def _does_not_pierce(
@@ -244,8 +251,7 @@ def _does_the_verb(clip: Clip, requested: RequestedVerb | Unmeasured) -> Check:
     if isinstance(requested, Unmeasured):
         return Check(name, None, requested.reason)
     verb, actions, numbers = requested.verb, requested.ranges.actions, requested.numbers
-    paths_m = _vertex_paths_m(clip)
-    farthest_m = float(np.linalg.norm(paths_m - paths_m[0], axis=2).max())
+    farthest_m = _travel_m(_vertex_paths_m(clip))
     if farthest_m < STILL_M and _moves_its_object(actions, verb):
         words = f"{verb!r} moves its object, but no point of it moves farther than {100 * farthest_m:.1f} cm"
         return Check(name, False, f"{words} (at least {100 * STILL_M:.0f} cm)")

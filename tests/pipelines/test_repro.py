@@ -122,7 +122,7 @@ def test_a_failing_conversion_leaves_the_clips_in_place(built, project_tools):
 def test_switching_profiles_back_and_forth_runs_nothing_again(built, project_tools):
     with kept(built / "params.yaml") as params:
         project_tools.write_params(built, {**yaml.safe_load(params), "profile": "own"})
-        other = project_tools.run(built, "dvc", "repro", "models/text2hoi/dvc.yaml:train@own-grab-contact")
+        other = project_tools.run(built, "dvc", "repro", "models/text2hoi/dvc.yaml:train-contact@own-grab")
     assert other.returncode == 0, other.stderr
     assert (built / "checkpoints/own/grab/contact/empty.json").is_file()
     assert stages_run(project_tools.run(built, "dvc", "repro").stdout) == [CODE]
