@@ -76,7 +76,7 @@ def add_dataset(project: Path) -> None:
 
 def set_adapter(project: Path) -> None:
     params = read_params(project)
-    set_params(project, convert={**params["convert"], "adapters": {"grab": {"margin_frames": 3}}})
+    set_params(project, convert={**params["convert"], "adapters": {"h2o": {"margin_frames": 3}}})
 
 
 def set_in_embedded(project: Path) -> None:
@@ -111,7 +111,7 @@ CHANGES = (
         touch("hoidata/datasets/grab/adapter.py"),
         "convert, raw of grab",
     ),
-    Change("its settings: `convert.adapters.grab`", set_adapter, "convert of grab"),
+    Change("settings of one: `convert.adapters.h2o`", set_adapter, "convert of h2o"),
     Change(
         "a setting of one profile: `profiles.embedded.sample`",
         set_in_embedded,
@@ -125,8 +125,8 @@ CHANGES = (
     Change(
         "a dataset is added: `hoidata/datasets/toy/`, its word",
         add_dataset,
-        "report; annotate, contact, controls, convert, evaluate, evaluator, quality, raw, sample, split, train, "
-        "train-diffusion, train-refiner of toy",
+        "report; annotate, contact, controls, convert, evaluate, evaluator, quality, raw, sample, split, "
+        "train-contact, train-diffusion, train-length, train-refiner of toy",
     ),
     Change(
         "the sentences: `hoidata/annotation/sentences.py`",
