@@ -12,7 +12,7 @@ from pipelines.commands.project import current_profile, enter_project, hands_of
 Data = Annotated[
     Path | None,
     typer.Option(
-        help="An annotated dataset such as data/embedded/grab, or a store. Default: the datasets of the project.",
+        help="An annotated dataset such as data/embedded/grab, or a store. Default: the project's.",
         exists=True,
         file_okay=False,
         resolve_path=True,
@@ -21,18 +21,16 @@ Data = Annotated[
 
 
 def show(
-    clip_or_dataset: Annotated[str, typer.Argument(metavar="[CLIP]", help="Id of a clip, or name of a dataset.")] = "",
+    clip_or_dataset: Annotated[str, typer.Argument(metavar="[CLIP]", help="Id of a clip, or a dataset.")] = "",
     out: Annotated[Path | None, typer.Option(help="Output folder. Default: .hoidata/pages.", resolve_path=True)] = None,
     open_page: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False,
     profile: Annotated[
         str, typer.Option(help="Profile: embedded, study or own. Default: the one in params.yaml.")
     ] = "",
     data: Data = None,
-    figures: Annotated[
-        bool, typer.Option("--figures", help="Write the figures of Text2HOI with the project's networks instead.")
-    ] = False,
+    figures: Annotated[bool, typer.Option("--figures", help="The figures of Text2HOI instead.")] = False,
 ) -> None:
-    """Write a self-contained web page about a clip (motion, contact, curves, sentences, origin) or a dataset."""
+    """Write a self-contained web page about a clip or a dataset."""
     if data is not None and not figures:
         pages = [_write_page_of(data, clip_or_dataset, out or Path.cwd())]
     elif clip_or_dataset and data is None:

@@ -162,9 +162,8 @@ def _methods(subject: Subject) -> Figure:
     panels = [subject.panel("recorded", recorded, true_contact(subject.annotated, subject.clip_id))]
     for family in subject.families:
         if family != RECORDED:
-            panels += subject.sampled_panel(
-                family, replace(subject.paths, family=family).samples, METHODS.get(family, "")
-            )
+            samples = replace(subject.paths, family=family).samples
+            panels += subject.sampled_panel(family, samples, METHODS.get(family, ""))
     words = "All methods on one prompt; coloured: the points that a hand touches. Only test clips have sampled motions."
     return Figure("methods", "Fig. 4", "Methods side by side", words, _same_camera(panels))
 
@@ -206,9 +205,8 @@ def _of_motions(
     for caption, motion in motions.items():
         shown = shown_motion(motion, subject.generator.hands, caption)
         contact_map = replace(shown["maps"][0], caption="predicted contact map", contact_label="")
-        panels.append(
-            Panel(caption, [contact_map, replace(shown["player"], caption="motion")], summary(motion.verdict))
-        )
+        players = [contact_map, replace(shown["player"], caption="motion")]
+        panels.append(Panel(caption, players, summary(motion.verdict)))
         agreement = f"{f1_score(motion.contact, first.contact):.2f}"
         rows.append((caption, f"{100 * motion.contact.mean():.0f}", agreement, str(motion.clip.n_frames)))
     head = ("motion", "points in the contact map, %", "F1 with the first map", "frames")
@@ -240,7 +238,7 @@ def _refined(subject: Subject) -> Figure:
             rows.append((title, *(_cell(results, one.name) for one in REFINER_METRICS)))
             panels += subject.sampled_panel(family, out)
     words = (
-        f"The refiner network on perturbed recordings; mean and 95 % interval of at most {REFINED_CLIPS} test clips."
+        f"The refiner network on perturbed recordings; means and 95 % intervals of up to {REFINED_CLIPS} test clips."
     )
     head = ("motion", *(f"{one.title}, {one.unit}" if one.unit else one.title for one in REFINER_METRICS))
     return Figure("refiner", "Fig. S6", "The refiner on perturbed recordings", words, _same_camera(panels), head, rows)
