@@ -57,6 +57,8 @@ FAMILIES = {
     "hands-still": "models.baselines.controls:HANDS_STILL",
     "hands-shifted": "models.baselines.controls:HANDS_SHIFTED",
     "noise": "models.baselines.controls:NOISE",
+    "noise-refined": "models.text2hoi.controls:NOISE_REFINED",
+    "pressed-refined": "models.text2hoi.controls:PRESSED_REFINED",
     "bimart-other-path": "models.bimart.family:OTHER_PATH",
     "bimart-other-object": "models.bimart.family:OTHER_OBJECT",
     "bimart-zero-map": "models.bimart.family:ZERO_MAP",

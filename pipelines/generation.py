@@ -91,13 +91,7 @@ def generate_files(request: GenerationRequest, out: Path, store: Path | None = N
     hands = models.hands
     model = user.model if user else _stored_object(str(request.object), models)
     notes += _missing_hinge_notes(verb, request.object, model)
-    generator = Generator.load(
-        models.checkpoints,
-        hands,
-        models.encoder,
-        sampling=replace(models.sampling, **request.sampling),
-        points=models.points,
-    )
+    generator = _generator(models, replace(models.sampling, **request.sampling))
     generator = replace(generator, model=generator.model.with_sampler(**request.sampler))
     ups = generator.object_ups
     in_training = user is None and (not ups or model.name in ups)
@@ -115,6 +109,16 @@ def generate_files(request: GenerationRequest, out: Path, store: Path | None = N
     clips = [replace(motion.clip, verb=evidence["verb"]) for motion in motions]
     paths += write_motion_store(store, clips, hands, generator.model.facts)
     return WrittenFiles(paths, notes, verdicts)
+
+
+def load_generator(profile: str, dataset: str) -> Generator:
+    """The networks of a dataset, with the settings of params.yaml. Raises MissingResource if one is not trained."""
+    models, _ = _project_models(GenerationRequest("", "", profile, (dataset,), dataset), None, None)
+    return _generator(models, models.sampling)
+
+
+def _generator(models: Models, sampling: SamplingConfig) -> Generator:
+    return Generator.load(models.checkpoints, models.hands, models.encoder, sampling=sampling, points=models.points)
 
 
 def _preset_notes(checkpoints: Path, networks: Sequence[str]) -> list[str]:

@@ -11,6 +11,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
+from rich.console import Console
 from rich.progress import track
 
 from hoidata.batches.dataset import ClipSample, HoiDataset
@@ -204,7 +205,7 @@ def _motions(
 ) -> Iterator[Clip | Skipped]:
     """The answers in order; adds each motion's contact condition, if the family reports it, to ``contacts``."""
     starts = range(0, len(test), CLIPS_AT_ONCE)
-    for start in track(starts, description="sampling", transient=True):
+    for start in track(starts, description="sampling", transient=True, console=Console(stderr=True)):
         chosen = test[start : start + CLIPS_AT_ONCE]
         requests = [request for sample in chosen for request in requests_for(sample, config)]
         answers, maps = parts.answers(start, sampler, requests) if parts else _answers(sampler, requests)

@@ -4,10 +4,12 @@ A negative control is Text2HOI with one input replaced: a metric that does not c
 
 A retrieval baseline has no network: it retrieves a training clip of the same prompt or verb. With contact refinement it
 is the baseline of ``text2hoi-contact``.
+
+A refined control is a perturbed recording after the refiner network (Text2HOI, Fig. S6).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,13 +17,16 @@ import torch
 from torch import Tensor
 
 from hoidata.batches.dataset import ClipSample, HoiDataset
-from hoidata.batches.requests import Request
-from hoidata.clips.clip import Clip
+from hoidata.batches.requests import Request, collate_requests
+from hoidata.clips.clip import SIDES, Clip
+from hoidata.clips.features import hand_features, object_features
 from hoidata.hands import HandPair
 from hoidata.refinement import refine_grasps
+from models.baselines.controls import NOISE, PRESSED, PerturbedRecording
 from models.baselines.retrieval import PROMPT_LOOKUP, VERB_LOOKUP
 from models.common.family import Family, Sampler, Skipped, Sources
 from models.text2hoi.family import NAMES, OtherPrompt, load_text2hoi, other_prompts
+from models.text2hoi.refiner import Surface
 from models.text2hoi.sampler import Text2Hoi
 
 
@@ -119,3 +124,44 @@ def _refined(retrieval: Family) -> Family:
 
 
 PROMPT_RETRIEVAL_REFINED, VERB_RETRIEVAL_REFINED = _refined(PROMPT_LOOKUP), _refined(VERB_LOOKUP)
+
+
+@dataclass(frozen=True)
+class RefinedControl:
+    """A perturbed recording with the hands of the refiner network, which is given the recorded contact map."""
+
+    control: PerturbedRecording
+    model: Text2Hoi
+
+    def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
+        clips, contact_maps = self.control.sample_with_targets(requests)
+        surface = self.model.surface(requests)
+        assert surface is not None
+        return [
+            self._refined(request, clip, contact_map, surface) if isinstance(clip, Clip) else clip
+            for request, clip, contact_map in zip(requests, clips, contact_maps, strict=True)
+        ]
+
+    def _refined(self, request: Request, clip: Clip, contact_map: np.ndarray, surface: Surface) -> Clip:
+        """The clip with refined active hands; the object and the tracked frames stay as they are."""
+        frame = request.world_from_model[:3, :3].T, request.world_from_model[:3, 3]
+        hands = np.stack([hand_features(clip.hands[side].with_last_valid_pose(), *frame) for side in SIDES])
+        features = hands, object_features(clip.object, *frame), contact_map[None].astype(np.float32)
+        given, objects, contact = (torch.from_numpy(array)[None].to(self.model.device) for array in features)
+        batch = collate_requests([request]).to(self.model.device)
+        moved = self.model.refine(batch, given, objects, contact, surface)[0]
+        refined = self.model.refined_clip(request, moved, objects[0]).hands.items()
+        tracks = {side: replace(track, valid=clip.hands[side].valid) for side, track in refined if track.valid.any()}
+        return replace(clip, hands={**clip.hands, **tracks})
+
+
+def _refined_control(control: Family) -> Family:
+    def load(sources: Sources) -> Sampler:
+        perturbed = control.load(sources)
+        assert isinstance(perturbed, PerturbedRecording)
+        return RefinedControl(perturbed, load_text2hoi(sources, refine="network"))
+
+    return _family(f"{control.name}-refined", f"{control.title}, refined", load)
+
+
+NOISE_REFINED, PRESSED_REFINED = _refined_control(NOISE), _refined_control(PRESSED)

@@ -170,7 +170,7 @@ class Text2Hoi:
         Args:
             contact_maps: one per request, (2, N) by hand or (N,) for both, from 0 to 1, instead of sampled ones.
         """
-        surface, answers = self._surface(requests), dict[int, Answer]()
+        surface, answers = self.surface(requests), dict[int, Answer]()
         for numbers in bucket_by_length(requests):
             chosen = [requests[number] for number in numbers]
             batch = collate_requests(chosen).to(self.device)
@@ -225,7 +225,7 @@ class Text2Hoi:
         clip = motion_clip(request, hands, objects, self.facts["synthetic"])
         return refine_grasps(self.pair, clip) if self.config.refine == "contact" else clip
 
-    def _surface(self, requests: Sequence[Request]) -> Surface | None:
+    def surface(self, requests: Sequence[Request]) -> Surface | None:
         """Distances to the requests' objects, if the refiner network needs them."""
         models = {request.object.name: request.object for request in requests}.values()
         return Surface.of(self.hands, models, self.device) if self.config.refine == "network" and models else None

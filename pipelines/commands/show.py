@@ -12,7 +12,7 @@ from pipelines.commands.project import current_profile, enter_project, hands_of
 Data = Annotated[
     Path | None,
     typer.Option(
-        help="An annotated dataset such as data/embedded/grab, or a store. Default: the datasets of the project.",
+        help="An annotated dataset such as data/embedded/grab, or a store. Default: the project's.",
         exists=True,
         file_okay=False,
         resolve_path=True,
@@ -21,27 +21,35 @@ Data = Annotated[
 
 
 def show(
-    clip_or_dataset: Annotated[str, typer.Argument(metavar="[CLIP]", help="Id of a clip, or name of a dataset.")] = "",
+    clip_or_dataset: Annotated[str, typer.Argument(metavar="[CLIP]", help="Id of a clip, or a dataset.")] = "",
     out: Annotated[Path | None, typer.Option(help="Output folder. Default: .hoidata/pages.", resolve_path=True)] = None,
     open_page: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False,
     profile: Annotated[
         str, typer.Option(help="Profile: embedded, study or own. Default: the one in params.yaml.")
     ] = "",
     data: Data = None,
+    figures: Annotated[bool, typer.Option("--figures", help="The figures of Text2HOI instead.")] = False,
 ) -> None:
-    """Write a self-contained web page about a clip (motion, contact, curves, sentences, origin) or a dataset."""
-    if data is not None:
-        path = _write_page_of(data, clip_or_dataset, out or Path.cwd())
-    elif clip_or_dataset:
+    """Write a self-contained web page about a clip or a dataset."""
+    if data is not None and not figures:
+        pages = [_write_page_of(data, clip_or_dataset, out or Path.cwd())]
+    elif clip_or_dataset and data is None:
         project = enter_project()
         from pipelines.show_pages import write_named_page
 
-        path = write_named_page(clip_or_dataset, profile or current_profile(), out or project / ".hoidata" / "pages")
+        folder, profile = out or project / ".hoidata" / "pages", profile or current_profile()
+        if figures:
+            from pipelines.pages.figures import write_figures
+
+            pages = write_figures(clip_or_dataset, profile, folder)
+        else:
+            pages = [write_named_page(clip_or_dataset, profile, folder)]
     else:
-        raise BadInput("hoidata show", "a clip's id, a dataset's name, or --data FOLDER", "none", "name one")
-    typer.echo(path)
+        expected = "a clip's id, a dataset's name, or (without --figures) --data FOLDER"
+        raise BadInput("hoidata show", expected, clip_or_dataset or "none", "name one")
+    typer.echo("\n".join(map(str, pages)))
     if open_page:
-        typer.launch(path.resolve().as_uri())
+        typer.launch(pages[0].resolve().as_uri())
 
 
 def _write_page_of(data: Path, clip_id: str, out: Path) -> Path:

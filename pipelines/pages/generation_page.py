@@ -74,12 +74,12 @@ def write_generation(
         verdicts=[
             (f"sample {motion.evidence['number'] + 1}", summary(motion.verdict), motion.verdict) for motion in motions
         ],
-        motions=[_shown(motion, hands, f"sample {motion.evidence['number'] + 1}") for motion in motions],
+        motions=[shown_motion(motion, hands, f"sample {motion.evidence['number'] + 1}") for motion in motions],
         facts=[*generation_facts(motions, checkpoints), ("hand model", hands.name)],
     )
 
 
-def _shown(motion: GeneratedMotion, hands: HandPair, caption: str) -> dict[str, Any]:
+def shown_motion(motion: GeneratedMotion, hands: HandPair, caption: str) -> dict[str, Any]:
     """The content of the page for one motion. Large meshes are simplified on the page only."""
     text, reached = str(motion.evidence["text"]), reached_contact(motion, hands)
     clip, coarse = (simplified_for_page(shown) for shown in (motion.clip, motion.coarse))

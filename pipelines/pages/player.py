@@ -113,12 +113,7 @@ def contact_player(
 
 
 def write_page(path: str | Path, template: str, **values: object) -> Path:
-    """Write the HTML of one template atomically; arguments as in ``render_page``."""
-    return write_whole(path, render_page(template, **values))
-
-
-def render_page(template: str, **values: object) -> str:
-    """The HTML of one template of this package; values are escaped, and an undefined name is an error."""
+    """Write the HTML of one template of this package; values are escaped, and an undefined name is an error."""
     environment = Environment(
         loader=FileSystemLoader(_FOLDER),
         autoescape=True,
@@ -127,12 +122,13 @@ def render_page(template: str, **values: object) -> str:
         lstrip_blocks=True,
     )
     has_players = bool(values.get("has_players"))
-    return environment.get_template(template).render(
+    page = environment.get_template(template).render(
         css=Markup((_FOLDER / "page.css").read_text(encoding="utf-8")),
         three_js=Markup(three_javascript()) if has_players else "",
         player_js=Markup((_FOLDER / "player.js").read_text(encoding="utf-8")) if has_players else "",
         **values,
     )
+    return write_whole(path, page)
 
 
 @lru_cache(maxsize=1)

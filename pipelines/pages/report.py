@@ -8,7 +8,6 @@ from markupsafe import Markup
 
 from hoidata.clips.clip import Clip
 from hoidata.dataset_folders import dataset_title
-from hoidata.files import atomic_file
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.info import embedded_hand_warning
@@ -17,7 +16,7 @@ from pipelines.pages.dataset_facts import DatasetFacts, read_dataset, reason_for
 from pipelines.pages.dataset_page import can_be_shown, write_dataset_page
 from pipelines.pages.examples import first_motion, motion_contact, shown_ids, shown_subset, true_contact
 from pipelines.pages.metrics_table import CONTROLS, RETRIEVAL_BASELINES, MetricsTable, metrics_tables
-from pipelines.pages.player import Player, contact_player, motion_player, render_page
+from pipelines.pages.player import Player, contact_player, motion_player, write_page
 from pipelines.pages.quality import QualityFacts, read_quality
 from pipelines.pages.summary import MAX_EXAMINED, Summary, dataset_summary
 from pipelines.pages.surface import ContactPaint
@@ -85,18 +84,14 @@ def write_report(
     sections = [section for section in all_sections if not section.facts.empty or section.facts.quarantine]
     synthetic = any(section.facts.synthetic for section in sections)
     has_players = any(section.motions or section.contact or section.examples for section in sections)
-    page = render_page(
-        "report.html", title=f"hoidata report: {profile}", profile=profile, sections=sections,
-        empty_sections=[section for section in all_sections if section.facts.empty], synthetic=synthetic,
-        hand_model=hands.name, has_players=has_players, max_examined=MAX_EXAMINED, stand_ins=_stand_ins(sections),
-    )  # fmt: skip
     for section in sections:
         if section.page:
             write_dataset_page(out, folders.data / section.facts.name, section.facts.name, hands, section.title)
-    path = Path(out) / "index.html"
-    with atomic_file(path) as part:
-        part.write_text(page, encoding="utf-8")
-    return path
+    return write_page(
+        Path(out) / "index.html", "report.html", title=f"hoidata report: {profile}", profile=profile, sections=sections,
+        empty_sections=[section for section in all_sections if section.facts.empty], synthetic=synthetic,
+        hand_model=hands.name, has_players=has_players, max_examined=MAX_EXAMINED, stand_ins=_stand_ins(sections),
+    )  # fmt: skip
 
 
 def _stand_ins(sections: Sequence[Section]) -> list[str]:

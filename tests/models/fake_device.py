@@ -179,7 +179,7 @@ def sampled(stored: dict[str, Checkpoint], sampler: SamplerConfig, requests: lis
     batch, generators = collate_requests(requests).to(DEVICE), [torch.Generator().manual_seed(0) for _ in requests]
     contact = model.sample_contact(batch, generators)
     hands, objects = model.denoise(batch, [None] * len(requests), contact, generators)
-    surface = model._surface(requests)
+    surface = model.surface(requests)
     assert surface is not None
     assert model.refine(batch, hands, objects, contact, surface).shape == hands.shape
 

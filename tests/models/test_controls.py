@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -16,16 +16,17 @@ from hoidata.metrics.target_contact import read_target_contact
 from hoidata.refinement import refine_grasps
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
-from models.baselines.controls import HANDS_AWAY_M
+from models.baselines.controls import HANDS_AWAY_M, PerturbedRecording
 from models.baselines.retrieval import Prompt, Retrieval, by_sentence, of_the_hand
 from models.common.family import Skipped, Sources
 from models.common.predicting import PredictionConfig, requests_for, sample_family
 from models.registry import load_family
-from models.text2hoi.controls import OtherContact, OwnContact, other_contact_maps
+from models.text2hoi.controls import OtherContact, OwnContact, RefinedControl, other_contact_maps
+from models.text2hoi.refiner import CoarseMotion, RefinerModel
 from models.text2hoi.sampler import Text2Hoi
 
 HANDS = load_embedded_hands()
-PERTURBED = ("static", "reversed", "object-moved", "hands-away", "pressed", "noise")
+PERTURBED = ("static", "reversed", "object-moved", "hands-away", "pressed", "noise", "noise-refined", "pressed-refined")
 LOOKUPS = (
     *(
         "prompt-retrieval",
@@ -211,6 +212,44 @@ def test_noise_is_5_mm_at_a_joint_and_never_twice_the_same(sources, annotated, t
         off += [np.linalg.norm(joints(perturbed, side) - true, axis=2).mean() for perturbed in (one, two)]
         assert abs(one.hands[side].wrist_m - two.hands[side].wrist_m).max() > 1e-3
     assert np.mean(off) == pytest.approx(0.005, abs=4e-4)
+
+
+@dataclass(frozen=True)
+class Untracked:
+    """A control whose acting hand is not tracked in the first three frames."""
+
+    control: PerturbedRecording
+
+    def sample_with_targets(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
+        clips, maps = self.control.sample_with_targets(requests)
+        hidden = []
+        for clip in clips:
+            assert isinstance(clip, Clip)
+            tracks = {side: replace(track, valid=np.arange(clip.n_frames) >= 3) for side, track in clip.hands.items()}
+            hidden.append(replace(clip, hands=tracks))
+        return hidden, maps
+
+
+@pytest.mark.parametrize("name", ["noise", "pressed"])
+def test_a_refined_control_has_the_hands_of_the_refiner_and_the_recorded_object(sources, test, name, monkeypatch):
+    """The refiner is replaced by one that lifts both hands by 1 cm."""
+
+    def lifted(network: RefinerModel, coarse: CoarseMotion) -> torch.Tensor:
+        return coarse.hands + torch.eye(99)[2] * 0.01
+
+    monkeypatch.setattr("models.text2hoi.sampler.refine", lifted)
+    model = load_family(f"{name}-refined").load(sources)
+    assert isinstance(model, RefinedControl)
+    for sample in test:
+        side, (perturbed,) = acting(sample), motions(sources, name, sample, 1)
+        for control, first in ((model.control, 0), (Untracked(model.control), 3)):
+            (refined,) = replace(model, control=control).sample(requests_of(sample, 1))
+            assert isinstance(refined, Clip)
+            moved = (joints(refined, side) - joints(perturbed, side))[first:]
+            np.testing.assert_allclose(moved, np.broadcast_to(-0.01 * perturbed.gravity, moved.shape), atol=2e-5)
+            assert np.flatnonzero(refined.hands[side].valid)[0] == first
+            np.testing.assert_array_equal(refined.object.rotvec, perturbed.object.rotvec)
+            np.testing.assert_array_equal(refined.object.translation_m, perturbed.object.translation_m)
 
 
 def test_other_hands_come_from_a_training_clip_and_the_object_is_recorded(sources, annotated, test):
