@@ -105,9 +105,7 @@ def annotate_store(
         excluded: reasons of clips that get no sentence, by clip id.
         changes: fields that replace those of ``settings``.
 
-    Returns:
-        Counts: clips, annotated, left_out; by hand type left, right, both; sentences (distinct), labelled, agreeing
-        (the labelled hand is the close one), derived_verbs.
+    Returns the counts of info.json.
     """
     settings, contact = replace(settings or AnnotationSettings(), **changes), contact or ContactSettings()
     threshold_m = contact.threshold_m if settings.threshold_m is None else settings.threshold_m

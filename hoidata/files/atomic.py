@@ -125,10 +125,8 @@ def _is_dead(name: str) -> bool:
 def exclusive(path: str | Path, wait_s: float = _WAIT_S) -> Iterator[int]:
     """Lock ``path`` for writing. Yields the file descriptor of the lock file ``.<name>.lock`` next to it.
 
-    The system releases the lock when the last process with the descriptor ends.
-
-    Raises:
-        BadInput: another process still has the lock after ``wait_s`` seconds.
+    The system releases the lock when the last process with the descriptor ends. Raises BadInput if another process
+    still has the lock after ``wait_s`` seconds.
     """
     path, descriptors = Path(path), []
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -134,16 +134,9 @@ def missing_parts(clips: Mapping[str, int]) -> dict[str, str]:
 def assign_split(sequences: pd.DataFrame, rule: SplitRule) -> pd.Series:
     """Assign each clip to "train", "validation", "test" or None (excluded), whatever the order of the clips.
 
-    Args:
-        sequences: a store's ``sequences`` table. The columns clip_id, subject, object, other_objects, sequence,
-            first_source_frame and last_source_frame are used, and verb and hand_type of the annotation.
-        rule: how to split.
-
-    Returns:
-        The part of each clip, under the index of ``sequences``.
-
-    Raises:
-        BadInput: too few clips can be held out.
+    sequences: a store's ``sequences`` table, whose index the result has. The columns clip_id, subject, object,
+    other_objects, sequence, first_source_frame and last_source_frame are used, and verb and hand_type of the
+    annotation. Raises BadInput if too few clips can be held out.
     """
     clips = sequences.reset_index(drop=True)
     if rule.by in IN_TIME:
@@ -297,13 +290,8 @@ def hold_out(
     Greedy: the next group is one that brings a part closer to its size. Among these it is the group whose most held-out
     component is held out the least, never completely. The SHA-256 of the name decides between equal groups.
 
-    Args:
-        groups: group of each clip.
-        components: of each clip, what training must also have if the clip is held out.
-        fractions: by part, the fraction of all clips that it gets.
-
-    Returns:
-        The part of each held-out group.
+    groups, components: of each clip. fractions: by part, the fraction of all clips that it gets. Returns the part of
+    each held-out group.
     """
     counts: dict[str, Counter[Hashable]] = defaultdict(Counter)
     for group, items in zip(groups, components, strict=True):
@@ -334,10 +322,7 @@ def without_shared_frames(
 ) -> list[str | None]:
     """Exclude clips (None) that share frames with a clip of a part that is earlier in ``order``.
 
-    Args:
-        spans: sequence, first and last source frame of each clip.
-        parts: part of each clip.
-        order: parts, those that keep their clips first.
+    spans: sequence, first and last source frame of each clip.
     """
     used: dict[Hashable, list[tuple[int, int, str]]] = defaultdict(list)
     disjoint: list[str | None] = [None] * len(spans)

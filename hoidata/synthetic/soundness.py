@@ -58,13 +58,7 @@ class Soundness:
 
 
 def measure(truth: TruthSequence, pair: HandPair, hand_shift_m: np.ndarray | None = None) -> Soundness:
-    """Measure an action at 30 fps.
-
-    Args:
-        truth: the action.
-        pair: hand models.
-        hand_shift_m: (3,) world translation of the active hands, for the negative control.
-    """
+    """Measure an action at 30 fps. hand_shift_m: (3,) translation of the active hands, for the negative control."""
     truth = truth.at_30_fps()
     lifted = np.flatnonzero(truth.lifted)
     near: dict[Side, SignedDistance] = {

@@ -20,14 +20,17 @@ from hoidata.datasets.gaps import bridge, has_pose, mark_interpolated, missing_p
 from hoidata.datasets.gravity import GravityEstimate, TrackedObject, estimate_gravity
 from hoidata.datasets.h2o.files import (
     ACTIONS,
+    FITTED,
     LISTS,
     OBJECTS,
+    PARAMETERS,
     HandSource,
+    KeypointHands,
+    ParameterHands,
     SequenceFrames,
     listed_segments,
     read_frames,
 )
-from hoidata.datasets.h2o.hands import FITTED, PARAMETERS, KeypointHands, ParameterHands
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import Interval, runs, widened
 from hoidata.geometry.rotations import rotmat_to_rotvec
@@ -183,8 +186,7 @@ def _labelled_ranges(
 ) -> Iterator[tuple[int, int, int | None, str]]:
     """Yield start, stop (exclusive), action label and location of each run, from labels or from a segment list.
 
-    Raises:
-        BadInput: neither labels nor a list, or the list names missing frames.
+    Raises BadInput without labels and list, or if the list names missing frames.
     """
     if frames.label is not None and frames.label.any():
         for start, stop in label_runs(frames.label):

@@ -26,15 +26,13 @@ from hoidata.datasets.hoi4d.files import (
     PartPose,
     ShortPose,
     action_events,
+    aligned_from_whole,
     camera_poses,
     frame_numbers,
     hand_frame,
     hinge_joint,
-    object_poses,
-)
-from hoidata.datasets.hoi4d.parts import (
-    aligned_from_whole,
     match_boxes,
+    object_poses,
     upsample_frames,
     upsample_hand,
     upsample_rotvecs,

@@ -28,8 +28,7 @@ from hoidata.datasets.gaps import (
     trim_to_recorded,
 )
 from hoidata.datasets.hinge import box_corners
-from hoidata.datasets.hot3d.files import HandFormat, Poses, object_words
-from hoidata.datasets.hot3d.sources import PARTS, Profile, Source, joints_m, read_source
+from hoidata.datasets.hot3d.files import PARTS, HandFormat, Poses, Profile, Source, joints_m, object_words, read_source
 from hoidata.datasets.segments import segment_clips
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import Interval, bridged, runs, split_evenly, widened
@@ -276,19 +275,10 @@ def _recording(raw: RawTree, source: Source, hands: HandPair) -> _Recording:
 
 
 def frame_times(path: str, times_ns: list[np.ndarray]) -> np.ndarray:
-    """Merge the times of all files to frames.
+    """Merge the times of all files to frames: (frame,) int64, the first time of each frame in ns.
 
     Times within 2 ms belong to one frame. Gaps of up to three frames are filled, so that poses can be interpolated.
-
-    Args:
-        path: for errors.
-        times_ns: times of each file.
-
-    Returns:
-        (frame,) int64, first time of each frame in ns.
-
-    Raises:
-        BadInput: frames are closer than half of 1/30 s.
+    Raises BadInput for frames closer than half of 1/30 s.
     """
     times = np.unique(np.concatenate(times_ns))
     first = times[np.r_[True, np.diff(times) > MAX_SAME_FRAME_NS]]
@@ -396,13 +386,10 @@ def _moves(track: ObjectTrack, interval: Interval) -> bool:
 
 
 def _is_cut(interval: Interval, is_tracked: np.ndarray) -> bool:
-    """Whether tracking of the object or a hand begins or ends at the ends of the interval.
+    """Whether tracking of the object or a hand begins or ends at the ends of a contact interval.
 
     A hand that is untracked on both sides of an end does not count, because the other hand touches.
-
-    Args:
-        interval: a contact interval.
-        is_tracked: (object and hands, frame) bool.
+    is_tracked: (object and hands, frame) bool.
     """
     ends = (interval.start, interval.start - 1), (interval.stop - 1, interval.stop)
     return any((is_tracked[:, a] & ~is_tracked[:, b]).any() for a, b in ends if 0 <= b < is_tracked.shape[1])

@@ -281,15 +281,9 @@ def _hand_track(motion: BvhMotion) -> SourceHandTrack:
 
 
 def keypoints_m(motion: BvhMotion, side: Side, tips: dict[str, np.ndarray]) -> np.ndarray:
-    """World keypoints of a hand in hoidata's order.
+    """World keypoints (frame, 21, 3) of a right-handed hand motion in hoidata's order, metres.
 
-    Args:
-        motion: of the hand, right-handed.
-        side: of the hand.
-        tips: fingertip by joint in the joint's frame, of the right hand, right-handed, source units.
-
-    Returns:
-        (frame, 21, 3) metres.
+    tips: fingertip by joint in the joint's frame, of the right hand, right-handed, source units.
     """
     positions, rotations = motion.world_joints()
     index = {joint: i for i, joint in enumerate(motion.names)}

@@ -120,15 +120,7 @@ def frames_by_side(folder: str, keys: Mapping[Side, list[Hashable]], n_frames: i
     """Map each side's keys to frames. Keys are numbers, and a side may lack some.
 
     If a side has one key per frame, its sorted keys are the frames in order. If neither side is complete, the numbers
-    must be 0 to n - 1 or 1 to n, as the first and last number show.
-
-    Args:
-        folder: of the recording, for errors.
-        keys: of both sides.
-        n_frames: number of frames of the objects.
-
-    Raises:
-        BadInput: the numbering is ambiguous, or a number is out of range.
+    must be 0 to n - 1 or 1 to n, as the first and last number show; else BadInput is raised.
     """
     numbers: dict[Side, dict[Hashable, int]] = {
         side: _numbers(f"{folder}/{side}_hand.pkl", keys[side], n_frames) for side in SIDES
