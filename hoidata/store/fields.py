@@ -56,13 +56,13 @@ def _both(field: Field) -> tuple[Field, ...]:
     )
 
 
-def _array(name: str, dtype: str, axes: str, meaning: str, unit: str = "", frame: str = "", **further: bool) -> Field:
+def _array(
+    name: str, dtype: str, axes: str, meaning: str, unit: str = "", frame: str = "", required: bool = True
+) -> Field:
     """A field with axes. axes: what each counts, and its length if that is fixed: ``frame, xyz:3``."""
-    counts, lengths = zip(
-        *((count, length) for count, _, length in (a.partition(":") for a in axes.split(", "))), strict=True
-    )
-    shape = tuple(int(length) if length else count for count, length in zip(counts, lengths, strict=True))
-    return Field(name, dtype, meaning, shape, axes=counts, unit=unit, frame=frame, **further)
+    parts = [axis.partition(":") for axis in axes.split(", ")]
+    shape, counts = tuple(int(length or 0) or count for count, _, length in parts), tuple(part[0] for part in parts)
+    return Field(name, dtype, meaning, shape, axes=counts, unit=unit, frame=frame, required=required)
 
 
 def _rotvec(name: str, rows: str, meaning: str) -> Field:
