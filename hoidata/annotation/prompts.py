@@ -1,7 +1,7 @@
 """Parses a prompt (hand, verb and object), and checks it: is it English, and which words were not in training?"""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -9,7 +9,7 @@ import numpy as np
 from lemminflect import getAllLemmas
 
 from hoidata.annotation.encoders import TextEncoder
-from hoidata.annotation.grammar import Grammar, default_grammar, default_phrases
+from hoidata.annotation.grammar import default_grammar, default_phrases
 from hoidata.annotation.hand_choice import HandChoice, select_hand
 from hoidata.annotation.sentences import ACTIONS, JOINED
 from hoidata.annotation.vocabulary import Vocabulary
@@ -22,7 +22,6 @@ HAND_PHRASE = re.compile(
     r"\b(?:with|by)\s+(?:(?:only|just)\s+)?(?:(?:the|your|my|his|her|their|a|one)\s+)?(?:single\s+)?hand\b|"
     r"\busing\s+(?:(?:only|just)\s+)?(?:the|your|my|his|her|their|a|one)\s+(?:single\s+)?hand\b"
 )
-_RUN = re.compile(r"[\w-]+")
 # The words before the verb in "A knife is used by the right hand to chop".
 _PURPOSE = re.compile(r"\b(?:hold|holds|held|holding|use|uses|used|using)\b.*\bto $")
 
@@ -44,15 +43,6 @@ class _Match:
 
     def overlaps(self, other: "_Match") -> bool:
         return self.start < other.stop and other.start < self.stop
-
-
-@dataclass(frozen=True)
-class _Form:
-    """A word form and its base form."""
-
-    number: int  # position in the lexicon; between equally good readings the first one wins
-    words: str
-    base: str
 
 
 class Lexicon:
@@ -83,43 +73,29 @@ class Lexicon:
 
 
 class _Forms:
-    """Finds word forms in a text, indexed by their first word."""
+    """Finds word forms in a text."""
 
     def __init__(self, forms: Iterable[tuple[str, str]]) -> None:
         bases: dict[str, str] = {}
         for form, base in forms:
             if bases.setdefault(form.lower(), base) != base:
                 raise ValueError(f"{form!r} stands for both {bases[form.lower()]!r} and {base!r}")
-        self._by_start: dict[str, list[_Form]] = {}
-        for number, (words, base) in enumerate(bases.items()):
-            start = _RUN.match(words)
-            self._by_start.setdefault(start[0] if start else "", []).append(_Form(number, words, base))
+        whole = r"(?<![\w-]){}(?![\w-])"
+        self._forms = [(form, re.compile(whole.format(re.escape(form))), base) for form, base in bases.items()]
 
     def matches(self, text: str) -> list[_Match]:
         """Find whole words. Matches of one form do not overlap; sorted by position in the lexicon, then in the text."""
-        matches: list[tuple[int, _Match]] = []
-        stops: dict[int, int] = {}
-        for form, start in self._candidates(text):
-            stop = start + len(form.words)
-            whole = text.startswith(form.words, start) and not _RUN.match(text, stop)
-            if whole and start >= stops.get(form.number, 0):
-                stops[form.number] = stop
-                matches.append((form.number, _Match(form.base, start, stop)))
-        return [match for _, match in sorted(matches, key=lambda entry: entry[0])]
-
-    def _candidates(self, text: str) -> Iterator[tuple[_Form, int]]:
-        for run in _RUN.finditer(text):
-            for form in self._by_start.get(run[0], ()):
-                yield form, run.start()
-        for form in self._by_start.get("", ()):  # begins with a bracket or quotation mark
-            yield from ((form, start) for start in range(len(text)) if not _RUN.match(text, max(start - 1, 0), start))
+        present = [(pattern, base) for form, pattern, base in self._forms if form in text]
+        return [_Match(base, *match.span()) for pattern, base in present for match in pattern.finditer(text)]
 
 
-def grammar_lexicon(grammar: Grammar) -> Lexicon:
-    """Build the lexicon of a grammar: all verb forms, and objects without articles.
+@lru_cache(maxsize=1)
+def _default_lexicon() -> Lexicon:
+    """Build the lexicon of the grammar: all verb forms, and objects without articles.
 
     It includes idioms ("look through" for see) and the words of the reference implementation.
     """
+    grammar = default_grammar()
     verbs = [(form, verb.base) for verb in grammar.verbs.values() for form in sorted(set(verb.forms))]
     verbs += [(form, base) for base, verb in ACTIONS.items() if base in grammar.verbs for form in verb.forms]
     for (base, _), phrase in default_phrases().verbs.items():
@@ -132,16 +108,10 @@ def grammar_lexicon(grammar: Grammar) -> Lexicon:
     return Lexicon(verbs, nouns + joined)
 
 
-@lru_cache(maxsize=1)
-def _default_lexicon() -> Lexicon:
-    return grammar_lexicon(default_grammar())
-
-
-def read_prompt(text: str, encoder: TextEncoder | None = None, grammar: Grammar | None = None) -> PromptReading:
-    """Parse hand, verb and object of an English prompt with the words of a grammar (see ``Lexicon.read``)."""
-    lexicon = _default_lexicon() if grammar is None else grammar_lexicon(grammar)
-    verb, noun = lexicon.read(text)
-    return PromptReading(select_hand(text, encoder), _labels().get((verb, noun), verb), noun)
+def read_prompt(text: str) -> PromptReading:
+    """Parse hand, verb and object of an English prompt with the words of the grammar (see ``Lexicon.read``)."""
+    verb, noun = _default_lexicon().read(text)
+    return PromptReading(select_hand(text), _labels().get((verb, noun), verb), noun)
 
 
 @lru_cache(maxsize=1)

@@ -20,6 +20,7 @@ from hoidata.contact.proximity import ProximityIndex
 from hoidata.contact.settings import ContactSettings
 from hoidata.datasets.base import RawTree
 from hoidata.datasets.gaps import trim_to_recorded
+from hoidata.errors import BadInput
 from hoidata.geometry.intervals import Interval, bridged, runs
 from hoidata.geometry.rotations import rotation_angle
 from hoidata.hands import HandPair, track_joints
@@ -90,13 +91,8 @@ def _segments_of(recording: Clip, hands: HandPair) -> Iterator[Clip | Quarantine
     evidence = find_active_hands(recording, joints_m, ProximityIndex(points), settings.threshold_m)
     if evidence.hand_type is None:
         expected = f"a hand within {settings.threshold_m * 100:g} cm of the object"
-        yield Quarantined(
-            recording.clip_id,
-            where=recording.sequence,
-            expected=expected,
-            got="none in any frame",
-            remedy="nothing to do",
-        )
+        problem = BadInput(recording.sequence, expected, "none in any frame", "nothing to do")
+        yield Quarantined.from_error(recording.clip_id, problem)
     elif recording.n_frames <= LONGEST_FRAMES:
         yield recording
     else:

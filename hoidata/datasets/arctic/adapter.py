@@ -1,7 +1,7 @@
 """ARCTIC (Fan et al. 2023): two hands and a hinged object; segments and verbs from Text2HOI's description files."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any, get_args
@@ -203,6 +203,12 @@ MOTION_PARTS = (
     DatasetPart("bodies", _below_top_folders("raw_seqs/s*/*.smplx.npy"), "raw_seqs.zip", optional=True),
     DatasetPart("image offsets", _below_top_folders("meta/misc.json"), "meta.zip", optional=True),
 )
+DESCRIPTIONS = DatasetPart(
+    "frame ranges and verbs",
+    _below_top_folders("description/s*/*/description.txt"),
+    "Text2HOI's description files (linked from its and ARCTIC's page)",
+    unneeded_with="clips=segments",
+)
 WITHHELD_SUBJECT = "s03"
 KINDS = ("mano.npy", "object.npy", "egocam.dist.npy", "smplx.npy")
 
@@ -243,17 +249,7 @@ class ArcticAdapter(AdapterBase):
     @property
     def parts(self) -> tuple[DatasetPart, ...]:
         """Files of a complete raw folder. Descriptions are required for the setting ``clips: described`` only."""
-        files = _below_top_folders("description/s*/*/description.txt")
-        archive = "Text2HOI's description files (linked from its and ARCTIC's page)"
-        optional = self.clips != "described"
-        descriptions = DatasetPart(
-            contents="frame ranges and verbs",
-            patterns=files,
-            archive=archive,
-            optional=optional,
-            unneeded_with="clips=segments",
-        )
-        return (*MOTION_PARTS, descriptions)
+        return (*MOTION_PARTS, replace(DESCRIPTIONS, optional=self.clips != "described"))
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per sequence with at least one of its files. Files are paired by name."""

@@ -373,16 +373,8 @@ def _checked(location: str, labels: np.ndarray) -> np.ndarray:
 
 
 def _joined(parts: list[SourceContact], by_columns: bool) -> SourceContact:
-    """Concatenate parts, sorted by frame and vertex. Empties ``parts`` to save memory."""
-    n_labels = sum(len(part.frame) for part in parts)
-    whole = SourceContact(*(np.empty(n_labels, dtype) for dtype in (np.int32, np.int32, np.uint8)))
-    stop = n_labels
-    while parts:
-        part = parts.pop()
-        start = stop - len(part.frame)
-        whole.frame[start:stop], whole.vertex[start:stop], whole.label[start:stop] = part.frame, part.vertex, part.label
-        stop = start
-    if not by_columns:
-        return whole
-    order = np.lexsort((whole.vertex, whole.frame))
-    return SourceContact(whole.frame[order], whole.vertex[order], whole.label[order])
+    """Concatenate parts, sorted by frame and vertex."""
+    empty = SourceContact(np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.uint8))
+    frame, vertex, label = (np.concatenate([vars(part)[name] for part in (empty, *parts)]) for name in vars(empty))
+    order = np.lexsort((vertex, frame)) if by_columns else slice(None)
+    return SourceContact(frame[order], vertex[order], label[order])

@@ -81,6 +81,7 @@ PARTS = (
     ),
 )
 EVENT_FILES = (f"{ANNOTATIONS}/{CLIP}/action/color.json",)
+EVENT_PART = DatasetPart("events", EVENT_FILES, "HOI4D_annotations.zip", unneeded_with="clips=segments")
 
 
 class _ObjectMotion(NamedTuple):
@@ -120,15 +121,7 @@ class Hoi4dAdapter(AdapterBase):
     @property
     def parts(self) -> tuple[DatasetPart, ...]:
         """Files of a complete raw folder. Events are required for the setting ``clips: described`` only."""
-        optional = self.clips != "described"
-        events = DatasetPart(
-            contents="events",
-            patterns=EVENT_FILES,
-            archive="HOI4D_annotations.zip",
-            optional=optional,
-            unneeded_with="clips=segments",
-        )
-        return (*PARTS, events)
+        return (*PARTS, replace(EVENT_PART, optional=self.clips != "described"))
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per recording that has a folder of annotations. The subject is the person, ``H2``."""
@@ -209,11 +202,8 @@ class Hoi4dAdapter(AdapterBase):
             start, stop = event.start, min(event.stop, n_frames)
             word, clip_id = event.word.lower(), f"{key}/{start:04d}-{stop:04d}"
             if word not in EVENTS:
-                expected = f"one of {', '.join(EVENTS)}"
-                got = repr(event.word)[:40]
-                unknown_events.append(
-                    Quarantined(clip_id, where=path, expected=expected, got=got, remedy="nothing to do")
-                )
+                problem = BadInput(path, f"one of {', '.join(EVENTS)}", repr(event.word)[:40], "nothing to do")
+                unknown_events.append(Quarantined.from_error(clip_id, problem))
             elif (action := EVENTS[word]) is not None and stop > start:
                 verb, hand = action
                 ranges[start, stop] = _ClipRange(clip_id, start=start, stop=stop, verb=verb, hand=hand)

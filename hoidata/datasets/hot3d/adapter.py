@@ -182,21 +182,15 @@ class Hot3dAdapter(AdapterBase):
             intervals = self._intervals(
                 recorded_object, recorded_object.has_pose & ~recording.failed, recording.times_ns, joints_m
             )
-            gaps = missing_poses(
+            yield from missing_poses(
                 f"{whole.clip_id}/{name}/missing", whole.sequence, name, whole.source_frames, recorded_object.tracked
             )
-            yield from gaps
             if intervals.cut:
                 expected = f"touches of {self.shortest_frames} frames between missing poses of the object or a hand"
                 yield _rejected(whole, f"{name}/cut", expected, intervals.cut, LOWER_SHORTEST_FRAMES)
             if intervals.short:
-                yield _rejected(
-                    whole,
-                    f"{name}/short",
-                    f"touches of {self.shortest_frames} frames",
-                    intervals.short,
-                    LOWER_SHORTEST_FRAMES,
-                )
+                expected = f"touches of {self.shortest_frames} frames"
+                yield _rejected(whole, f"{name}/short", expected, intervals.short, LOWER_SHORTEST_FRAMES)
             if intervals.still:
                 yield _rejected(whole, f"{name}/still", f"an object that moves {100 * MOVED_M:g} cm", intervals.still)
             for interval in intervals.clips:
@@ -223,13 +217,9 @@ class Hot3dAdapter(AdapterBase):
         if mean_m * 1000 <= self.most_fit_error_mm:
             return replace(clip, fit_error_m=mean_m)
         expected = f"hands that miss UmeTrack's joints by {self.most_fit_error_mm} mm or less on average"
-        return Quarantined(
-            clip_id,
-            where=recording.source.path,
-            expected=expected,
-            got=f"{1000 * mean_m:.1f} mm",
-            remedy="nothing to do, or raise the setting most_fit_error_mm",
-        )
+        remedy = "nothing to do, or raise the setting most_fit_error_mm"
+        problem = BadInput(recording.source.path, expected, f"{1000 * mean_m:.1f} mm", remedy)
+        return Quarantined.from_error(clip_id, problem)
 
     def _intervals(
         self, recorded_object: _RecordedObject, usable: np.ndarray, times: np.ndarray, joints_m: np.ndarray

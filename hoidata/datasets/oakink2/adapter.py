@@ -136,13 +136,9 @@ class Oakink2Adapter(AdapterBase):
             actions = [(_whole(annotation, item), [item]) for item in scene.objects_of(list(annotation.parts))]
         described_in = program_path if has_program else path
         for segment, objects in actions:
-            reason = _unusable_reason(segment, objects)
-            if reason is not None:
-                expected, got = reason
-                name = f"{key}/{segment.name}"
-                results.append(
-                    Quarantined(name, where=described_in, expected=expected, got=got, remedy="nothing to do")
-                )
+            if reason := _unusable_reason(segment, objects):
+                problem = BadInput(described_in, *reason, "nothing to do")
+                results.append(Quarantined.from_error(f"{key}/{segment.name}", problem))
                 continue
             whole = Clip(
                 clip_id=f"{key}/{segment.name}",

@@ -93,14 +93,10 @@ class TacoAdapter(AdapterBase):
         clip = whole.take(slice(max(0, start - self.margin_frames), stop + self.margin_frames))
         without_shape: list[Side] = [side for side in SIDES if not _has_shape(raw, key, side)]
         notes = [clip.gravity_note, *(SHAPE_NOTE.format(side=side) for side in without_shape)]
+        remedy = "nothing to do: the clip has zero betas, as TACO's own loader gives them"
+        absent = "the shape of the hand", "no file", remedy
         reasons = [
-            Quarantined(
-                f"{key}/{side}-shape",
-                where=_shape_path(key, side),
-                expected="the shape of the hand",
-                got="no file",
-                remedy="nothing to do: the clip has zero betas, as TACO's own loader gives them",
-            )
+            Quarantined.from_error(f"{key}/{side}-shape", BadInput(_shape_path(key, side), *absent))
             for side in without_shape
         ]
         return [replace(clip, sources=raw.sources, gravity_note="; ".join(notes)), *reasons]
