@@ -146,13 +146,7 @@ class Candidates(NamedTuple):
 
     def take(self, rows: np.ndarray) -> "Candidates":
         placement, hands = self.placement.take(rows), self.hands.take(rows)
-        return Candidates(
-            side=self.side,
-            placement=placement,
-            hands=hands,
-            wrist_m=self.wrist_m[rows],
-            flexion_rad=self.flexion_rad[rows],
-        )
+        return Candidates(self.side, placement, hands, self.wrist_m[rows], flexion_rad=self.flexion_rad[rows])
 
     def points(self, flexion_rad: np.ndarray) -> np.ndarray:
         """Return (candidate, 21, 4, 3) capsule points, with fingers flexed by ``flexion_rad (candidate, 5, 3)``."""
@@ -284,21 +278,14 @@ def posed_hands(candidates: Candidates, betas: np.ndarray) -> PosedHands:
     rotmats, spread, rows = candidates.placement.rotmats, candidates.placement.spread_rad, candidates.placement.hand
     pose = hand_pose_rotvec(candidates.hands, candidates.flexion_rad, spread)
     opened = hand_pose_rotvec(candidates.hands, candidates.open_rad, spread)
-    if candidates.side == "right":
-        return PosedHands(
-            side="right",
-            wrist_m=candidates.wrist_m,
-            rotmats=rotmats,
-            hand_pose=pose,
-            open_pose=opened,
-            betas=betas[rows],
-        )
-    mirror = np.diag(MIRROR)
-    pose, opened = (mirror_rotvec_x(one.reshape(-1, 15, 3)).reshape(-1, 45) for one in (pose, opened))
+    wrist_m = candidates.wrist_m
+    if candidates.side == "left":
+        wrist_m, rotmats = wrist_m * MIRROR, np.diag(MIRROR) @ rotmats @ np.diag(MIRROR)
+        pose, opened = (mirror_rotvec_x(one.reshape(-1, 15, 3)).reshape(-1, 45) for one in (pose, opened))
     return PosedHands(
-        side="left",
-        wrist_m=candidates.wrist_m * MIRROR,
-        rotmats=mirror @ rotmats @ mirror,
+        side=candidates.side,
+        wrist_m=wrist_m,
+        rotmats=rotmats,
         hand_pose=pose,
         open_pose=opened,
         betas=betas[rows],

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import HandType, Side
 from hoidata.synthetic.actions import DATASET_IDS
-from hoidata.synthetic.catalogue import HINGE_BEHIND, ObjectSpec, box_at, hinged, object_spec, tilted
+from hoidata.synthetic.catalogue import ObjectSpec, box_at, hinged, hinged_behind, object_spec, tilted
 from hoidata.synthetic.grasps import Approach, GraspSpec
 from hoidata.synthetic.paths import Key, Motion, Swing
 from hoidata.synthetic.shapes import Solid, cylinder, revolved, rounded_box, united
@@ -79,30 +79,24 @@ def _one(name: str, direction: Vector, through: Vector | None, width=0.3, blend=
     return Region(name, GraspSpec((("right", Approach(direction, width, through, blend)),)), yaw)
 
 
-def _two(name: str, left: tuple, right: tuple, yaw=0.0, width=0.25) -> Region:
+def _two(name: str, left: tuple, right: tuple, yaw=0.0) -> Region:
     """left, right: (direction, target point) of each hand."""
     approaches: Reaches = (
-        ("left", Approach(left[0], width, left[1], (0, 0.7))),
-        ("right", Approach(right[0], width, right[1], (0, 0.7))),
+        ("left", Approach(left[0], 0.25, left[1], (0, 0.7))),
+        ("right", Approach(right[0], 0.25, right[1], (0, 0.7))),
     )
     return Region(name, GraspSpec(approaches), yaw)
 
 
 def _lid(name: str, direction: Vector) -> Region:
-    return Region(
-        name,
-        GraspSpec(
-            (("right", Approach(direction=direction, width=0.4, through_m=None, blend=(0, 0.9), part=1)),),
-            ANGLES[0],
-            ANGLES,
-        ),
-    )
+    approach = Approach(direction, blend=(0, 0.9), part=1)
+    return Region(name, GraspSpec((("right", approach),), ANGLES[0], ANGLES))
 
 
 def _base_and_lid(name: str, base: Vector, lid: Vector) -> Region:
     approaches: Reaches = (
-        ("left", Approach(direction=base, width=0.45, through_m=None, blend=(0, 0.8), part=0)),
-        ("right", Approach(direction=lid, width=0.45, through_m=None, blend=(0, 0.8), part=1)),
+        ("left", Approach(base, 0.45, part=0)),
+        ("right", Approach(lid, 0.45, part=1)),
     )
     return Region(name, GraspSpec(approaches, ANGLES[0], ANGLES))
 
@@ -219,21 +213,12 @@ GRAB_STUDY = (
 )
 
 _BOX = hinged("box", "box", 0.1, 0.07, 0.07, 0.035)
-_WAFFLE_IRON = ObjectSpec(
-    name="waffleiron",
-    words="waffle iron",
-    base=_waffle_iron_base,
-    lid=lambda: _waffle_iron_half(0.026, 0.0135),
-    stand_m=0.0,
-    standing_deg=HINGE_BEHIND,
-)
-_CAPSULE_MACHINE = ObjectSpec(
-    name="capsulemachine",
-    words="capsule machine",
-    base=box_at((0.07, 0.11, 0.14), (0, -0.055, -0.0705), 0.004, 0.015),
-    lid=box_at((0.066, 0.1, 0.025), (0, -0.05, 0.013)),
-    stand_m=0.0,
-    standing_deg=HINGE_BEHIND,
+_WAFFLE_IRON = hinged_behind("waffleiron", "waffle iron", _waffle_iron_base, lambda: _waffle_iron_half(0.026, 0.0135))
+_CAPSULE_MACHINE = hinged_behind(
+    "capsulemachine",
+    "capsule machine",
+    box_at((0.07, 0.11, 0.14), (0, -0.055, -0.0705), 0.004, 0.015),
+    box_at((0.066, 0.1, 0.025), (0, -0.05, 0.013)),
 )
 _PARTS = ((-1.0, -0.3, 0.0), (1.0, -0.4, 0.4))
 
