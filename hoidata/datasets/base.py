@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from operator import attrgetter
 from pathlib import Path
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from hoidata.clips.clip import Clip, SourceFile, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention
@@ -176,6 +176,11 @@ class AdapterBase:
     @property
     def source_fps(self) -> float:
         return float(self.facts.source_fps)
+
+    def new_clip(self, key: SequenceKey, **fields: Any) -> Clip:
+        """A clip of a sequence. Unless given, its id is the key, and its frame rate that of the source."""
+        origin = {"dataset": self.name, "subject": key.subject, "sequence": key.name}
+        return Clip(**{"clip_id": str(key), **origin, "source_fps": self.source_fps, **fields})
 
 
 @dataclass

@@ -310,11 +310,9 @@ class ArcticAdapter(AdapterBase):
         start: int,
         stop: int,
     ) -> Clip:
-        whole = Clip(
+        whole = self.new_clip(
+            key,
             clip_id=clip_id,
-            dataset=self.name,
-            subject=key.subject,
-            sequence=key.name,
             hands=motion.hands,
             object=motion.object,
             source_frames=np.arange(motion.n_frames, dtype=np.int32),
@@ -323,7 +321,6 @@ class ArcticAdapter(AdapterBase):
             object_words=object_words(motion.object.model.name),
             labelled_hand=None if description is None else description.hand,
             sources=raw.sources,
-            source_fps=self.source_fps,
             camera=motion.camera,
             body=motion.body,
         )

@@ -151,11 +151,8 @@ class GrabAdapter(AdapterBase):
         contact = read_contact(source.file, source.path, source.n_frames, len(model.vertices_m), step, self.contact)
         start, stop = _contact_range(source, contact.touched, self.margin_frames)
         frames = np.arange(start * step, stop * step, step)
-        clip = Clip(
-            clip_id=str(key),
-            dataset=self.name,
-            subject=key.subject,
-            sequence=key.name,
+        clip = self.new_clip(
+            key,
             hands={side: _hand(raw, source, side, frames, hands) for side in SIDES},
             object=_object_track(source, "object", model, frames),
             other_objects=_table(raw, source, frames),

@@ -147,11 +147,9 @@ class H2OAdapter(AdapterBase):
         world_from_object = frames.camera[start:stop] @ _poses(frames)[start:stop]
         tracks, fit_error_m = sequence.hands.tracks(start, stop)
         source_frames = np.arange(frames.first + start, frames.first + stop, dtype=np.int32)
-        return Clip(
+        return self.new_clip(
+            sequence.key,
             clip_id=_clip_id(sequence.key, frames, run.start, run.stop),
-            dataset=self.name,
-            subject=sequence.key.subject,
-            sequence=sequence.key.name,
             hands=tracks,
             object=bridge(
                 ObjectTrack(
@@ -166,7 +164,6 @@ class H2OAdapter(AdapterBase):
             gravity_note=sequence.gravity.note,
             verb=run.verb,
             object_words=run.noun,
-            source_fps=self.source_fps,
             sources=sequence.sources,
             hands_from="parameters" if self.needs_mano else "keypoints",
             fit_error_m=fit_error_m,

@@ -143,11 +143,8 @@ class Hoi4dAdapter(AdapterBase):
             images=upsample_frames(len(camera)).astype(np.int32),
         )
         gravity, gravity_note = _gravity(object_motion, tracks, camera, hands)
-        whole = Clip(
-            clip_id=str(key),
-            dataset=self.name,
-            subject=key.subject,
-            sequence=key.name,
+        whole = self.new_clip(
+            key,
             hands=tracks,
             object=object_motion.track,
             source_frames=mark_interpolated(camera_track.images, object_motion.recorded),
@@ -156,7 +153,6 @@ class Hoi4dAdapter(AdapterBase):
             verb=None,
             object_words=category.words,
             sources=raw.sources,
-            source_fps=self.source_fps,
             camera=camera_track,
         )
         clips = self._cut(whole, camera_track.images, ranges, object_motion)

@@ -147,11 +147,9 @@ class Hot3dAdapter(AdapterBase):
         recording = _recording(raw, source, hands)
         source_from_world = np.eye(4)
         source_from_world[:3, :3] = WORLD_FROM[source.headset].T
-        whole = Clip(
-            clip_id=str(key),
-            dataset=self.name,
+        whole = self.new_clip(
+            key,
             subject=source.subject,
-            sequence=key.name,
             hands=recording.hands.tracks,
             object=recording.objects[0].track,
             source_frames=np.arange(len(recording.times_ns), dtype=np.int32),
@@ -159,7 +157,6 @@ class Hot3dAdapter(AdapterBase):
             verb=None,
             object_words="",
             source_from_world=source_from_world,
-            source_fps=self.source_fps,
             hands_from="keypoints" if source.profile else "parameters",
             sources=raw.sources,
         )

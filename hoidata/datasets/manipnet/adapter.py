@@ -189,11 +189,8 @@ class ManipNetAdapter(AdapterBase):
         """The frames of an interval as a clip. The caller replaces id, verb and sources."""
         frames = slice(*interval)
         fits = fit_hands({side: points[frames] for side, points in recording.keypoints_m.items()}, hands, betas)
-        return Clip(
-            clip_id=str(key),
-            dataset=self.name,
-            subject=key.subject,
-            sequence=key.name,
+        return self.new_clip(
+            key,
             hands={side: hand_track(f.wrist_m, f.global_orient, f.hand_pose, f.betas) for side, f in fits.items()},
             object=ObjectTrack(
                 recording.model,

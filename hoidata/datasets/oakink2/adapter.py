@@ -140,11 +140,9 @@ class Oakink2Adapter(AdapterBase):
                 problem = BadInput(described_in, *reason, "nothing to do")
                 results.append(Quarantined.from_error(f"{key}/{segment.name}", problem))
                 continue
-            whole = Clip(
+            whole = self.new_clip(
+                key,
                 clip_id=f"{key}/{segment.name}",
-                dataset=self.name,
-                subject=key.subject,
-                sequence=key.name,
                 hands=tracks,
                 object=objects[0].track,
                 source_frames=annotation.frames.astype(np.int32),
@@ -153,7 +151,6 @@ class Oakink2Adapter(AdapterBase):
                 object_words=str(objects[0].words),
                 labelled_hand=segment.hand,
                 other_objects=tuple(other.track for other in objects[1:]),
-                source_fps=self.source_fps,
                 gravity_note="; ".join(
                     [GRAVITY_NOTE, *(scene_object.note for scene_object in objects if scene_object.note)]
                 ),

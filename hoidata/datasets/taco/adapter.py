@@ -74,11 +74,8 @@ class TacoAdapter(AdapterBase):
         tool, target = (_object(raw, key, kind) for kind in ("tool", "target"))
         if target.n_frames != tool.n_frames:
             raise BadInput(f"{OBJECTS}/{key.name}/target", f"{tool.n_frames} frames as the tool", f"{target.n_frames}")
-        whole = Clip(
-            clip_id=str(key),
-            dataset=self.name,
-            subject=key.subject,
-            sequence=key.name,
+        whole = self.new_clip(
+            key,
             hands={side: to_track(hand, CONVENTION, hands[side]) for side, hand in _hands(raw, key, tool).items()},
             object=tool,
             other_objects=(target,),
@@ -87,7 +84,6 @@ class TacoAdapter(AdapterBase):
             gravity_note=GRAVITY_NOTE,
             verb=verb,
             object_words=tool_word,
-            source_fps=self.source_fps,
         )
         start, stop = _contact_range(whole, hands)
         clip = whole.take(slice(max(0, start - self.margin_frames), stop + self.margin_frames))
