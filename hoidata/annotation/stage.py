@@ -183,15 +183,7 @@ def _annotate_clips(
         else:
             sentences, reason = writer.sentences(clip, hand.active, evidence)
         annotated.append(
-            _Annotated(
-                clip_id=clip_id,
-                labelled_hand=clip.labelled_hand,
-                hand=hand,
-                evidence=evidence,
-                sentences=sentences,
-                reason=reason,
-                verb=verb,
-            )
+            _Annotated(clip_id, clip.labelled_hand, hand, evidence, sentences=sentences, reason=reason, verb=verb)
         )
     return annotated
 

@@ -90,13 +90,7 @@ def load_recorded(adapter: Adapter, root: Path, key: SequenceKey, hands: HandPai
     recorded = {source.path for source in raw.sources}
     unrecorded = tuple(sorted(path for path in opened if not {path, os.path.dirname(path)} & recorded))
     # An error may come before the file it is about was recorded.
-    return Loaded(
-        key=key,
-        results=_without_root(results, root),
-        sources=raw.sources,
-        unrecorded=() if error else unrecorded,
-        error=error,
-    )
+    return Loaded(key, _without_root(results, root), raw.sources, () if error else unrecorded, error=error)
 
 
 def first_difference(one: Any, other: Any, path: str = "") -> str | None:

@@ -100,13 +100,7 @@ def convert_dataset(
         raise RawFileChanged(root, "all files that are listed", got, remedy)
     work = FinishedWork(out.with_name(f".{out.name}.work"), root)
     convert = SequenceConverter(
-        adapter=adapter,
-        root=root,
-        hands=hands,
-        manifest=listed,
-        synthetic=synthetic,
-        work=work,
-        stop_on_change=stop_on_change,
+        adapter, root, hands, listed, synthetic=synthetic, work=work, stop_on_change=stop_on_change
     )
     with exclusive(out) as lock:
         remove_leftovers(out)

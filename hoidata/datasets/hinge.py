@@ -120,11 +120,7 @@ def hinged_model(name: str, vertices_m: list[np.ndarray], faces: list[np.ndarray
     counts = [len(vertices) for vertices in vertices_m]
     part = np.repeat(np.array([0, 1], np.uint8), counts)
     return ObjectModel(
-        name=name,
-        vertices_m=np.concatenate(vertices_m),
-        faces=np.concatenate([faces[0], faces[1] + counts[0]]),
-        part=part,
-        hinge=hinge,
+        name, np.concatenate(vertices_m), np.concatenate([faces[0], faces[1] + counts[0]]), part, hinge=hinge
     )
 
 

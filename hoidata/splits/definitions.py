@@ -234,12 +234,7 @@ def _read(path: Path) -> Definition:
         raise BadInput(path, "the split's version and source", f"{origin}", "state them there")
     rule, promises = _rule_and_promises(str(path), values)
     return Definition(
-        name=path.stem,
-        version=origin["version"],
-        source=origin["source"],
-        rule=rule,
-        promises=promises,
-        if_chosen=bool(if_chosen),
+        path.stem, origin["version"], origin["source"], rule, promises=promises, if_chosen=bool(if_chosen)
     )
 
 

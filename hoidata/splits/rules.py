@@ -245,7 +245,8 @@ def _in_time(clips: pd.DataFrame, rule: SplitRule) -> list[Part | None]:
     parts: list[Part | None] = [None] * len(clips)
     ordered = clips.sort_values(["sequence", "first_source_frame", "clip_id"], kind="stable")
     for _, group in ordered.groupby("sequence"):
-        group_parts = _by_rounds(len(group)) if rule.by == "rounds" else _by_share(len(group), rule)
+        rounds = [ROUND[number % len(ROUND)] for number in range(len(group))]
+        group_parts = rounds if rule.by == "rounds" else _by_share(len(group), rule)
         for clip, part in zip(group.index, group_parts, strict=True):
             parts[clip] = part
     return parts
@@ -276,10 +277,6 @@ def _drawn_per_object(clips: pd.DataFrame, rule: SplitRule) -> dict[str, Part]:
         if rule.test_share and "test" not in object_parts.values():
             parts[list(object_parts)[-1]] = "test"
     return parts
-
-
-def _by_rounds(n_clips: int) -> Sequence[Part]:
-    return [ROUND[index % len(ROUND)] for index in range(n_clips)]
 
 
 def hold_out(

@@ -82,7 +82,7 @@ class AnnotatedStore:
         embeddings = read_npz(annotation / "embeddings.npz")
         self.encoder_identity: dict[str, Any] = orjson.loads(embeddings["identity"].tobytes())
         self._features = embeddings["features"]
-        self._sentences = _by_clip(self.text)
+        self._sentences = {str(key): rows for key, rows in self.text.groupby("clip_id", sort=False)}
         self._objects = read_table(contact / "objects.parquet").set_index("object")
         self._clips = read_table(contact / "clips.parquet").set_index("clip_id")
         self._points = read_npz(contact / "points.npz")
@@ -213,10 +213,6 @@ class AnnotatedStore:
                 got = f"{len(clip_ids)} clips, {len(set(clip_ids) & set(self.store.ids))} in common"
                 expected = f"the {len(self.store)} clips of {self.store.folder}"
                 raise BadInput(self.root / folder, expected, got, "run its stage again")
-
-
-def _by_clip(text: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    return {str(key): rows for key, rows in text.groupby("clip_id", sort=False)}
 
 
 @dataclass(frozen=True)

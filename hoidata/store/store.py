@@ -285,9 +285,7 @@ class Store:
             return None
         rotvec, position_m, images = (array[first : first + facts["n_frames"]].copy() for array in shard.camera)
         intrinsics = None if intrinsics is None else np.array(intrinsics)
-        return CameraTrack(
-            name=facts["camera_name"], rotvec=rotvec, position_m=position_m, images=images, intrinsics=intrinsics
-        )
+        return CameraTrack(facts["camera_name"], rotvec, position_m, images, intrinsics=intrinsics)
 
     def _body(self, facts: dict[str, Any]) -> BodyTrack | None:
         if facts["body_row"] < 0:

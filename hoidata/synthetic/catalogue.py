@@ -243,10 +243,4 @@ def model_of(spec: ObjectSpec) -> ObjectModel:
         hinge = Hinge(ARCTIC_AXIS, np.zeros(3))
     # Rounded so that the files reproduce the ground truth exactly.
     stored = np.concatenate(vertices) @ spec.upright_from_object
-    return ObjectModel(
-        name=spec.name,
-        vertices_m=np.round(stored, 7),
-        faces=np.concatenate(faces),
-        part=np.concatenate(part),
-        hinge=hinge,
-    )
+    return ObjectModel(spec.name, np.round(stored, 7), np.concatenate(faces), np.concatenate(part), hinge=hinge)

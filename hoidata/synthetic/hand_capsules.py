@@ -239,14 +239,7 @@ def sample_placements(
     spread_rad = rng.uniform(-0.05, 0.05, (count, N_FINGERS))
     spread_rad[:, THUMB] = rng.uniform(-0.25, 0.25, count)
     rotmats = _rolled(normal, rng.uniform(-np.pi, np.pi, count))
-    return Placement(
-        rotmats=rotmats,
-        target_m=surface,
-        blend=palm_to_fingers,
-        gap_m=gap_m,
-        spread_rad=spread_rad,
-        hand=np.zeros(count, dtype=int),
-    )
+    return Placement(rotmats, surface, palm_to_fingers, gap_m, spread_rad=spread_rad, hand=np.zeros(count, dtype=int))
 
 
 def _rolled(normal: np.ndarray, roll: np.ndarray) -> np.ndarray:

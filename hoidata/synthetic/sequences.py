@@ -161,13 +161,7 @@ def plan_timing(dataset: str, action: Action, length: int, rng: np.random.Genera
     path_length = length - lead_frames
     start = contact_start + before
     contact_stop = start + path_length + after
-    return Timing(
-        contact_start=contact_start,
-        start=start,
-        length=path_length,
-        contact_stop=contact_stop,
-        end=contact_stop + OPEN + RETREAT,
-    )
+    return Timing(contact_start, start, path_length, contact_stop, end=contact_stop + OPEN + RETREAT)
 
 
 def make_sequence(

@@ -174,14 +174,7 @@ def _sound_clip(task: ClipTask, entry: StudyEntry, pair: HandPair) -> TruthSeque
         for attempt in range(len(_PLAYS) * len(grasps)):
             grips = grasps[(first + attempt) % len(grasps)]
             scenario = Scenario(
-                dataset=dataset,
-                study_object=study_object,
-                verb=entry.verb,
-                region=regions[0],
-                grips=grips,
-                person=person,
-                source_key=key,
-                left=left,
+                dataset, study_object, entry.verb, regions[0], grips=grips, person=person, source_key=key, left=left
             )
             truth = make_study_sequence(scenario, contact_frames, pair, _PLAYS[attempt // len(grasps)], rng)
             if measure(truth, pair).is_sound:

@@ -242,13 +242,7 @@ def _clip_id(key: SequenceKey, frames: SequenceFrames, start: int, stop: int) ->
 def _camera_track(frames: SequenceFrames, start: int, stop: int, images: np.ndarray) -> CameraTrack:
     poses = frames.camera[start:stop]
     rotvec = rotmat_to_rotvec(poses[:, :3, :3]).astype(np.float32)
-    return CameraTrack(
-        name=CAMERA,
-        rotvec=rotvec,
-        position_m=poses[:, :3, 3].astype(np.float32),
-        images=images,
-        intrinsics=frames.intrinsics,
-    )
+    return CameraTrack(CAMERA, rotvec, poses[:, :3, 3].astype(np.float32), images, intrinsics=frames.intrinsics)
 
 
 def _tracked_objects(frames: SequenceFrames, objects: dict[str, _Object]) -> list[TrackedObject]:

@@ -292,13 +292,7 @@ class ParameterHands:
         numbers = self.frames.hands[rows]
         block = numbers[:, :_PARAMETERS] if side == "left" else numbers[:, _PARAMETERS:]
         camera = self.frames.camera[rows]
-        source = SourceHand(
-            translation_m=block[:, 1:4],
-            global_orient=block[:, 4:7],
-            fingers=block[:, 7:52],
-            betas=block[:, 52:62],
-            valid=block[:, 0] != 0,
-        )
+        source = SourceHand(block[:, 1:4], block[:, 4:7], block[:, 7:52], block[:, 52:62], valid=block[:, 0] != 0)
         return to_track(source, PARAMETERS, self.models[side], FrameChange(camera[:, :3, :3], camera[:, :3, 3]))
 
 

@@ -360,11 +360,7 @@ def _object_motion(
     recorded = np.zeros(track.n_frames, bool)
     recorded[::2] = tracked
     return _ObjectMotion(
-        track=bridge(track, has_pose_or_neighbours),
-        tracked=has_pose_or_neighbours,
-        recorded=recorded,
-        note=note,
-        rejected_frames=rejected_frames,
+        bridge(track, has_pose_or_neighbours), has_pose_or_neighbours, recorded, note, rejected_frames=rejected_frames
     )
 
 
@@ -410,9 +406,7 @@ def _source_hand(raw: RawTree, key: SequenceKey, side: Side, n_frames: int) -> t
             continue
         pose[frame], betas[frame], translation_m[frame], valid[frame] = *hand[:2], hand.translation_m, True
     betas[~valid] = betas[valid][0] if valid.any() else 0
-    source = SourceHand(
-        translation_m=translation_m, global_orient=pose[:, :3], fingers=pose[:, 3:], betas=betas, valid=valid
-    )
+    source = SourceHand(translation_m, pose[:, :3], pose[:, 3:], betas, valid=valid)
     return source, faulty
 
 

@@ -252,13 +252,7 @@ def _recording(raw: RawTree, source: Source, hands: HandPair) -> _Recording:
     objects = [
         _recorded_object(raw, *source.models[key], poses, times, world) for key, poses in source.object_poses.items()
     ]
-    return _Recording(
-        source=source,
-        times_ns=times,
-        failed=rows_of_frames(times, source.failed_ns) >= 0,
-        hands=hand_tracks,
-        objects=objects,
-    )
+    return _Recording(source, times, rows_of_frames(times, source.failed_ns) >= 0, hand_tracks, objects=objects)
 
 
 def frame_times(path: str, times_ns: list[np.ndarray]) -> np.ndarray:

@@ -303,11 +303,7 @@ class Scene:
         last_tracked = np.clip(np.searchsorted(frames, np.arange(len(tracked)), side="right") - 1, 0, None)
         track = _track(model, fit.world_from_object[last_tracked], fit.hinge_rad[last_tracked])
         return SceneObject(
-            track=bridge(track, used_frames),
-            tracked=used_frames,
-            words=words,
-            note=f"{model.name}: {fit.note}",
-            rejected_frames=rejected_frames,
+            bridge(track, used_frames), used_frames, words, f"{model.name}: {fit.note}", rejected_frames=rejected_frames
         )
 
 

@@ -197,13 +197,7 @@ def _hand(
         pose[frame] = _single_row(f"{location}.hand_pose", checks.entry(location, entry, "hand_pose"), 48)
         translation_m[frame] = _single_row(f"{location}.hand_trans", checks.entry(location, entry, "hand_trans"), 3)
         valid[frame] = True
-    return SourceHand(
-        translation_m=translation_m,
-        global_orient=pose[:, :3],
-        fingers=pose[:, 3:],
-        betas=_betas(raw, key, side),
-        valid=valid,
-    )
+    return SourceHand(translation_m, pose[:, :3], pose[:, 3:], _betas(raw, key, side), valid=valid)
 
 
 def _dictionary(raw: RawTree, path: str) -> Mapping[Hashable, Any]:
