@@ -28,7 +28,7 @@ from hoidata.hands import HandPair
 from hoidata.metrics.evaluate import evaluate_store
 from hoidata.metrics.optional_metrics import select_metrics
 from hoidata.settings import build_config
-from hoidata.store.windows import WindowProtocol
+from hoidata.store.annotated import WindowProtocol
 from models.common.checkpoints import FILE_NAME
 from models.common.family import Family, Network
 from models.common.predicting import sample_family

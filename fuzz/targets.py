@@ -21,12 +21,11 @@ import trimesh
 from fuzz.engine import MAX_INPUT_BYTES, Target
 from hoidata.clips.clip import SourceFile
 from hoidata.datasets import checks
-from hoidata.datasets.arctic import files as arctic
+from hoidata.datasets.arctic import adapter as arctic
 from hoidata.datasets.base import RawTree
 from hoidata.datasets.h2o import files as h2o
 from hoidata.datasets.hoi4d import files as hoi4d
 from hoidata.datasets.hot3d import files as hot3d
-from hoidata.datasets.hot3d import sources
 from hoidata.datasets.manipnet import adapter as manipnet
 from hoidata.datasets.manipnet import hand as own_hand
 from hoidata.datasets.oakink2 import files as oakink2
@@ -301,7 +300,7 @@ def _datasets() -> dict[str, Target]:
             raw("hot3d", "*mano*.jsonl", lines=2), parse(hot3d.hand_poses, "a.jsonl", "mano"), [hot3d]
         ),
         "hot3d-tables": Target(raw("hot3d", "*objects.csv", "*mask*.csv", lines=3), parse(hot3d_tables), [hot3d]),
-        "hot3d-tar": Target(_packed_clip, parse(sources.read_packed, "a.tar"), [sources]),
+        "hot3d-tar": Target(_packed_clip, parse(hot3d.read_packed, "a.tar"), [hot3d]),
     }
 
 
@@ -349,7 +348,7 @@ def _json_files() -> dict[str, Target]:
         "store-info": Target(values(info, {**info, "schema_version": "9.0.0"}), open_store, [store]),
         "hoi4d-json": Target(hoi4d_seeds, parse(_hoi4d_json), [hoi4d]),
         "oakink2-json": Target(oakink2_seeds, parse(_oakink2_json), [oakink2]),
-        "hot3d-json": Target(hot3d_seeds, parse(_hot3d_json), [hot3d, sources]),
+        "hot3d-json": Target(hot3d_seeds, parse(_hot3d_json), [hot3d]),
         "hoidata-toml": Target(seed_files(TOML), on_disk("hoidata.toml", registered_root), [base]),
         "params-yaml": Target(seed_files(PARAMS), on_disk("params.yaml", settings), [base, params]),
     }
@@ -377,10 +376,10 @@ def _oakink2_json(data: bytes) -> None:
 def _hot3d_json(data: bytes) -> object:
     """Parse as the kind of file that the bytes resemble; compute the joints of a profile too."""
     if b"sequence_id" in data:
-        return sources.definition(data, "clip_definitions.json", 7)
+        return hot3d.clip_definition(data, "clip_definitions.json", 7)
     if b"headset" in data:
         return hot3d.headset(data, "metadata.json")
     if b"hand_model" not in data:
         return hot3d.object_names(data, "instance.json")
     pose = hot3d.Poses(np.zeros(1, int), np.eye(3)[None], np.zeros((1, 3)), {"joint_angles": np.ones((1, 22))})
-    return sources.joints_m(sources.parse_profile(data, "profile.json"), pose, "right")
+    return hot3d.joints_m(hot3d.parse_profile(data, "profile.json"), pose, "right")

@@ -9,7 +9,7 @@ from typing import Any
 
 from hoidata.actions.action import written_limits
 from hoidata.annotation.encoders import TextEncoder, load_encoder, not_clip_note
-from hoidata.annotation.sentence_check import further_verbs, read_sentence
+from hoidata.annotation.prompts import further_verbs, read_sentence
 from hoidata.annotation.settings import AnnotationSettings
 from hoidata.annotation.vocabulary import Vocabulary
 from hoidata.annotation.wording import Wording, understood_words

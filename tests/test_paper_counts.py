@@ -14,7 +14,7 @@ from hoidata.batches.requests import RequestBatch
 from hoidata.clips import HandTrack
 from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from hoidata.contact.settings import ContactSettings
-from hoidata.datasets.grab.words import OBJECTS
+from hoidata.datasets.grab.adapter import OBJECTS
 from hoidata.datasets.h2o.adapter import ACTIONS
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.splits.definitions import definitions_for, published

@@ -70,9 +70,7 @@ def derive_verb(clip: Clip, evidence: HandEvidence) -> Derived:
     - grasp: it rises by 1.5 cm or more.
     - hold, or touch if the object stays on its support or hands are close in less than 80 % of the frames.
 
-    Args:
-        clip: the clip.
-        evidence: hand distances of the same clip, at the threshold of its hand type.
+    evidence: hand distances of the same clip, at the threshold of its hand type.
     """
     motion = object_motion(clip, evidence)
     height_m, hinge = motion.height_m, _hinge(motion, clip.object.model.name)

@@ -34,19 +34,15 @@ def load_encoder(name: str) -> TextEncoder:
     """Load the encoder ``use`` (offline, default), ``hash`` (no semantics, for tests), ``clip:FILE`` or ``clip:TAG``.
 
     Append ``?quick_gelu=false`` to ``clip:FILE`` for weights trained with plain GELU (LAION). A tag of open_clip, such
-    as ``clip:openai``, is read from the local cache or downloaded.
-
-    Raises:
-        BadInput: the name is unknown.
-        MissingResource: a package or file is missing.
+    as ``clip:openai``, is read from the local cache or downloaded. Raises BadInput for an unknown name, MissingResource
+    if a package or file is missing.
     """
     if name == "use":
         return CachedEncoder(UniversalSentenceEncoder())
     if name == "hash":
         return CachedEncoder(HashEncoder())
     if name.startswith("clip:"):
-        from hoidata.annotation.clip_encoder import ClipEncoder
-        from hoidata.annotation.clip_weights import parse_weights_name
+        from hoidata.annotation.clip_encoder import ClipEncoder, parse_weights_name
 
         return CachedEncoder(ClipEncoder(parse_weights_name(name.removeprefix("clip:"))))
     raise BadInput("text encoder", "use, hash, clip:FILE.safetensors or clip:TAG", repr(name), "choose one of them")

@@ -47,10 +47,8 @@ def select_hand(
 ) -> HandChoice:
     """Find the hand that an English prompt requests.
 
-    Args:
-        text: the prompt.
-        encoder: used if no rule applies but the prompt has words for a hand and a side; needs a margin of 0.05.
-        prior: fraction of each hand type in the training clips; used last.
+    encoder: used if no rule applies but the prompt has words for a hand and a side; needs a margin of 0.05.
+    prior: fraction of each hand type in the training clips; used last.
     """
     mentions = find_mentions(text)
     evidence = "; ".join(mentions.evidence) or "no hand is named"

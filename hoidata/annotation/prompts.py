@@ -1,14 +1,20 @@
-"""Parses a prompt: hand, verb and object."""
+"""Parses a prompt (hand, verb and object), and checks it: is it English, and which words were not in training?"""
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
+import numpy as np
+from lemminflect import getAllLemmas
+
 from hoidata.annotation.encoders import TextEncoder
-from hoidata.annotation.grammar import Grammar, default_grammar, default_phrases
+from hoidata.annotation.grammar import default_grammar, default_phrases
 from hoidata.annotation.hand_choice import HandChoice, select_hand
 from hoidata.annotation.sentences import ACTIONS, JOINED
+from hoidata.annotation.vocabulary import Vocabulary
+from hoidata.clips.clip import HandType
+from hoidata.errors import BadInput
 
 HAND_PHRASE = re.compile(
     r"\b(?:(?:with|by|in|using)\s+)?(?:(?:the|your|my|his|her|their)\s+)?(?:left|right)\s+hand\b|"
@@ -16,7 +22,6 @@ HAND_PHRASE = re.compile(
     r"\b(?:with|by)\s+(?:(?:only|just)\s+)?(?:(?:the|your|my|his|her|their|a|one)\s+)?(?:single\s+)?hand\b|"
     r"\busing\s+(?:(?:only|just)\s+)?(?:the|your|my|his|her|their|a|one)\s+(?:single\s+)?hand\b"
 )
-_RUN = re.compile(r"[\w-]+")
 # The words before the verb in "A knife is used by the right hand to chop".
 _PURPOSE = re.compile(r"\b(?:hold|holds|held|holding|use|uses|used|using)\b.*\bto $")
 
@@ -40,23 +45,10 @@ class _Match:
         return self.start < other.stop and other.start < self.stop
 
 
-@dataclass(frozen=True)
-class _Form:
-    """A word form and its base form."""
-
-    number: int  # position in the lexicon; between equally good readings the first one wins
-    words: str
-    base: str
-
-
 class Lexicon:
-    """Surface forms of verbs and objects, and their base forms.
+    """Surface forms of verbs and objects, as pairs of a lower-case form and its base form.
 
-    Args:
-        verbs, nouns: pairs of a lower-case form and its base form.
-
-    Raises:
-        ValueError: a form has two base forms, so that it is ambiguous.
+    Raises ValueError if a form has two base forms, so that it is ambiguous.
     """
 
     def __init__(self, verbs: Iterable[tuple[str, str]], nouns: Iterable[tuple[str, str]]) -> None:
@@ -81,43 +73,29 @@ class Lexicon:
 
 
 class _Forms:
-    """Finds word forms in a text, indexed by their first word."""
+    """Finds word forms in a text."""
 
     def __init__(self, forms: Iterable[tuple[str, str]]) -> None:
         bases: dict[str, str] = {}
         for form, base in forms:
             if bases.setdefault(form.lower(), base) != base:
                 raise ValueError(f"{form!r} stands for both {bases[form.lower()]!r} and {base!r}")
-        self._by_start: dict[str, list[_Form]] = {}
-        for number, (words, base) in enumerate(bases.items()):
-            start = _RUN.match(words)
-            self._by_start.setdefault(start[0] if start else "", []).append(_Form(number, words, base))
+        whole = r"(?<![\w-]){}(?![\w-])"
+        self._forms = [(form, re.compile(whole.format(re.escape(form))), base) for form, base in bases.items()]
 
     def matches(self, text: str) -> list[_Match]:
         """Find whole words. Matches of one form do not overlap; sorted by position in the lexicon, then in the text."""
-        matches: list[tuple[int, _Match]] = []
-        stops: dict[int, int] = {}
-        for form, start in self._candidates(text):
-            stop = start + len(form.words)
-            whole = text.startswith(form.words, start) and not _RUN.match(text, stop)
-            if whole and start >= stops.get(form.number, 0):
-                stops[form.number] = stop
-                matches.append((form.number, _Match(form.base, start, stop)))
-        return [match for _, match in sorted(matches, key=lambda entry: entry[0])]
-
-    def _candidates(self, text: str) -> Iterator[tuple[_Form, int]]:
-        for run in _RUN.finditer(text):
-            for form in self._by_start.get(run[0], ()):
-                yield form, run.start()
-        for form in self._by_start.get("", ()):  # begins with a bracket or quotation mark
-            yield from ((form, start) for start in range(len(text)) if not _RUN.match(text, max(start - 1, 0), start))
+        present = [(pattern, base) for form, pattern, base in self._forms if form in text]
+        return [_Match(base, *match.span()) for pattern, base in present for match in pattern.finditer(text)]
 
 
-def grammar_lexicon(grammar: Grammar) -> Lexicon:
-    """Build the lexicon of a grammar: all verb forms, and objects without articles.
+@lru_cache(maxsize=1)
+def _default_lexicon() -> Lexicon:
+    """Build the lexicon of the grammar: all verb forms, and objects without articles.
 
     It includes idioms ("look through" for see) and the words of the reference implementation.
     """
+    grammar = default_grammar()
     verbs = [(form, verb.base) for verb in grammar.verbs.values() for form in sorted(set(verb.forms))]
     verbs += [(form, base) for base, verb in ACTIONS.items() if base in grammar.verbs for form in verb.forms]
     for (base, _), phrase in default_phrases().verbs.items():
@@ -130,16 +108,10 @@ def grammar_lexicon(grammar: Grammar) -> Lexicon:
     return Lexicon(verbs, nouns + joined)
 
 
-@lru_cache(maxsize=1)
-def _default_lexicon() -> Lexicon:
-    return grammar_lexicon(default_grammar())
-
-
-def read_prompt(text: str, encoder: TextEncoder | None = None, grammar: Grammar | None = None) -> PromptReading:
-    """Parse hand, verb and object of an English prompt with the words of a grammar (see ``Lexicon.read``)."""
-    lexicon = _default_lexicon() if grammar is None else grammar_lexicon(grammar)
-    verb, noun = lexicon.read(text)
-    return PromptReading(select_hand(text, encoder), _labels().get((verb, noun), verb), noun)
+def read_prompt(text: str) -> PromptReading:
+    """Parse hand, verb and object of an English prompt with the words of the grammar (see ``Lexicon.read``)."""
+    verb, noun = _default_lexicon().read(text)
+    return PromptReading(select_hand(text), _labels().get((verb, noun), verb), noun)
 
 
 @lru_cache(maxsize=1)
@@ -160,3 +132,133 @@ def _length(match: _Match) -> int:
 def _score(pair: tuple[_Match, _Match]) -> tuple[int, int]:
     verb, noun = pair
     return _length(verb) + _length(noun), -verb.start
+
+
+LONGEST_WORDS = 60
+KNOWN_SHARE = 0.6
+NAMED = 3
+# Words that the dictionary does not list.
+_FUNCTION_WORDS = """the a an with of to from in on onto into at and or then while it its your my his her their this
+that these those as if for until without using only one two three four five both each every no not towards toward
+beside against but because than nor per upon beneath during ok
+six seven eight nine ten twenty thirty forty fifty sixty ninety"""
+_BETWEEN_CLAUSES = re.compile(r"[,;.&]|\band/or\b|\b(?:and|then)\b")
+_ADVERBS = frozenset({"also", "again", "now", "next", "please", "first"})
+# A noun follows these words: "drink" in "a drink" is not a verb.
+LEFT_OF_NOUNS = ("a", "an", "the", "this", "that", "these", "those", "my", "your", "his", "her", "their", "its", "our")
+FUNCTION_WORDS = frozenset(re.findall(r"\w+", _FUNCTION_WORDS))
+
+
+def unseen_words(
+    known: Vocabulary, text: str, verb: str | None, thing: str | None, hand: HandType, encoder: TextEncoder
+) -> list[str]:
+    """What of a sentence was not in training, with the most similar training words; in words for the user."""
+    thing = thing or _known_object(known, text)
+    notes = []
+    if not verb or verb not in known.verbs:
+        word = verb or first_verb(text)
+        notes.append(_stranger("verb", word, known.verbs, encoder))
+    if not thing or thing not in known.objects:
+        notes.append(_stranger("object", thing, known.objects, encoder))
+    if notes:
+        return notes
+    if not any(key[:2] == (verb, thing) for key in known.counts):
+        return [f"{verb!r} and {thing!r} were each in training, never together"]
+    if (verb, thing, hand) not in known.counts:
+        return [f"{verb!r} with {thing!r} was in training, never with hand type {hand!r}"]
+    return []
+
+
+def _known_object(known: Vocabulary, text: str) -> str | None:
+    """The longest name of a training object in ``text``; also found in a sentence with an unknown verb."""
+    found = [thing for thing in known.objects if thing and re.search(rf"\b{re.escape(thing)}\b", text.lower())]
+    return max(found, key=len, default=None)
+
+
+def _stranger(kind: str, word: str | None, known: Mapping[str, int], encoder: TextEncoder) -> str:
+    if not word:
+        return f"no {kind} is in the sentence that training had; it had: {', '.join(sorted(filter(None, known)))}"
+    near = nearest_words(word, sorted(filter(None, known)), encoder)
+    return f"the {kind} {word!r} was never in training; nearest that were: {', '.join(near)}"
+
+
+def read_sentence(text: str) -> tuple[str | None, str | None]:
+    """Verb and object of a user's sentence, in base form; None if not in the word tables.
+
+    Raises BadInput for an empty text, more than 60 words, and text that is not English.
+    """
+    words = ["".join(filter(str.isalpha, word)) for word in text.split()]
+    words = [word.lower() for word in words if word]
+    remedy = "write an English sentence, like: Lift a mug with the right hand."
+    if not words:
+        raise BadInput("the sentence", "words", repr(text[:40]), remedy)
+    if len(words) > LONGEST_WORDS:
+        raise BadInput("the sentence", f"at most {LONGEST_WORDS} words", f"{len(words)} words", "ask for one action")
+    reading = read_prompt(text)
+    strange = [word for word in words if not is_english(word)]
+    if len(strange) > (1 - KNOWN_SHARE) * len(words) and not (reading.verb and reading.object_words):
+        raise BadInput("the sentence", "English", f"unknown words: {', '.join(strange[:8])}", remedy)
+    return reading.verb, reading.object_words
+
+
+def further_verbs(text: str, made: str | None, known: Vocabulary) -> list[str]:
+    """Training verbs in a sentence in addition to the generated one, such as "pour" in "Lift a mug and pour"."""
+    clauses = [re.findall(r"[a-z-]+", clause) for clause in _BETWEEN_CLAUSES.split(text.lower())]
+    clauses = [rest for words in clauses if (rest := words[_count_adverbs(words) :])]
+    verbs = sorted(filter(None, known.verbs))
+    ordered = bool(clauses) and _is_base_form(clauses[0][0])  # "Lift ..." and not "A hand lifts ..."
+    found = []
+    for number, words in enumerate(clauses):
+        starts = range(1) if ordered or number else _of_no_article(words)
+        told = (verb for start in starts for verb in verbs if _begins_with(words[start:], verb, known, ordered))
+        found += [verb for verb in (next(told, None),) if verb and verb != made]
+    return list(dict.fromkeys(found))
+
+
+def _count_adverbs(words: list[str]) -> int:
+    """Number of adverbs before a clause's verb."""
+    return next((n for n, word in enumerate(words) if not (word.endswith("ly") or word in _ADVERBS)), len(words))
+
+
+def _begins_with(words: list[str], verb: str, known: Vocabulary, ordered: bool) -> bool:
+    """Whether words begin with a known verb, and not with an object's name; in base form if ``ordered``."""
+    first, *others = verb.split()
+    fits = words[0] == first if ordered else first in getAllLemmas(words[0]).get("VERB", ())
+    if not fits or words[0] in known.objects:
+        return False
+    of_hand = first in ("hand", "use") and {"hand", "hands"} & set(words[1:4])  # "and use both hands"
+    return not of_hand and all(other in words[1:6] for other in others)
+
+
+def _of_no_article(words: list[str]) -> list[int]:
+    """Positions of a verb in a clause with a subject: not first, and not after an article."""
+    return [start for start in range(1, len(words)) if words[start - 1] not in ("a", "an", "the")]
+
+
+def _is_base_form(word: str) -> bool:
+    return word in getAllLemmas(word).get("VERB", ())
+
+
+def is_english(word: str) -> bool:
+    """Whether a lower-case word is in lemminflect's dictionary or a function word; ASCII only."""
+    return word.isascii() and (word in FUNCTION_WORDS or bool(getAllLemmas(word)))
+
+
+def nearest_words(word: str, known: list[str], encoder: TextEncoder) -> list[str]:
+    """The known words whose text features are most similar to those of ``word``, best first."""
+    features = encoder.encode([word, *known])
+    features = features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)
+    order = np.argsort(-(features[1:] @ features[0]), kind="stable")[:NAMED]
+    return [known[row] for row in order]
+
+
+def first_verb(text: str) -> str | None:
+    """The first word that can be a verb and follows no article, in base form."""
+    before = ""
+    for word in text.lower().split():
+        word = "".join(filter(str.isalpha, word))
+        lemmas = getAllLemmas(word).get("VERB")
+        if lemmas and word not in FUNCTION_WORDS and before not in LEFT_OF_NOUNS and word not in ("left", "right"):
+            return lemmas[0]
+        before = word if word not in ("left", "right") else before  # "the right hand"
+    return None

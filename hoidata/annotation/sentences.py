@@ -62,13 +62,8 @@ def english_sentences(verb: str | None, object_words: str, hand: HandType) -> tu
     book with both hands." Of an instrument: "Chop with a knife in the right hand.", "A knife is used by the right hand
     to chop."
 
-    Args:
-        verb: base form with its particle (``take out``); None becomes ``move``.
-        object_words: noun without article.
-        hand: the active hands.
-
-    Raises:
-        BadInput: the verb or the object has no word.
+    verb: base form with its particle (``take out``); None becomes ``move``. object_words: noun without article. Raises
+    BadInput if the verb or the object has no word.
     """
     grammar, phrases = default_grammar(), default_phrases()
     forms = grammar.verb(UNLABELLED_VERB if verb is None else verb)

@@ -105,9 +105,7 @@ def annotate_store(
         excluded: reasons of clips that get no sentence, by clip id.
         changes: fields that replace those of ``settings``.
 
-    Returns:
-        Counts: clips, annotated, left_out; by hand type left, right, both; sentences (distinct), labelled, agreeing
-        (the labelled hand is the close one), derived_verbs.
+    Returns the counts of info.json.
     """
     settings, contact = replace(settings or AnnotationSettings(), **changes), contact or ContactSettings()
     threshold_m = contact.threshold_m if settings.threshold_m is None else settings.threshold_m
@@ -185,15 +183,7 @@ def _annotate_clips(
         else:
             sentences, reason = writer.sentences(clip, hand.active, evidence)
         annotated.append(
-            _Annotated(
-                clip_id=clip_id,
-                labelled_hand=clip.labelled_hand,
-                hand=hand,
-                evidence=evidence,
-                sentences=sentences,
-                reason=reason,
-                verb=verb,
-            )
+            _Annotated(clip_id, clip.labelled_hand, hand, evidence, sentences=sentences, reason=reason, verb=verb)
         )
     return annotated
 

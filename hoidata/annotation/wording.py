@@ -15,13 +15,14 @@ from lemminflect import getAllLemmas
 from hoidata.annotation.encoders import TextEncoder
 from hoidata.annotation.grammar import default_grammar, default_phrases
 from hoidata.annotation.hand_choice import PHRASES
-from hoidata.annotation.prompts import HAND_PHRASE, read_prompt
-from hoidata.annotation.sentence_check import (
+from hoidata.annotation.prompts import (
     FUNCTION_WORDS,
+    HAND_PHRASE,
     LEFT_OF_NOUNS,
     first_verb,
     is_english,
     nearest_words,
+    read_prompt,
     read_sentence,
 )
 from hoidata.annotation.vocabulary import Vocabulary
@@ -68,14 +69,9 @@ def understood_words(
 ) -> Wording:
     """Prepare a sentence: correct it, and find its verb and object.
 
-    Args:
-        vocabulary: of the training clips.
-        encoder: returns a text encoder for suggestions; called only for an error.
-        names: further words that are spelt correctly, such as the name of a mesh file.
-        force: accept the sentence unchanged, whatever it contains.
-
-    Raises:
-        BadInput: a word is in no dictionary, or the verb was not in training; the message has suggestions.
+    encoder: returns a text encoder for suggestions; called only for an error. names: further words that are spelt
+    correctly, such as the name of a mesh file. force: accept the sentence unchanged, whatever it contains. Raises
+    BadInput, with suggestions, if a word is in no dictionary, or the verb was not in training.
     """
     notes = list[str]()
     if not force:

@@ -1,13 +1,13 @@
-"""Loads one sequence while recording which files are opened, and compares two results field by field."""
+"""Loads one sequence while recording which files are opened, compares results field by field; outcomes of the rules."""
 
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,6 +15,35 @@ from hoidata.clips.clip import Clip, SourceFile
 from hoidata.datasets.base import Adapter, Quarantined, RawTree, SequenceKey
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
+
+SHOWN = 3
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A rule with its outcome."""
+
+    rule: str  # as a sentence
+    outcome: Literal["pass", "warn", "fail", "skip"]  # warn: suspicious, may be right; skip: not testable on this input
+    detail: str = ""  # the first problems, or the reason for skipping
+
+
+def finding(rule: str, problems: Sequence[str], outcome: Literal["fail", "warn"] = "fail") -> Finding:
+    """Outcome "pass" without problems, else ``outcome`` with the first problems."""
+    if not problems:
+        return Finding(rule, "pass")
+    rest = len(problems) - SHOWN
+    return Finding(rule, outcome, "; ".join(problems[:SHOWN]) + (f"; and {rest} more" if rest > 0 else ""))
+
+
+def skipped(rule: str, why: str) -> Finding:
+    """The rule was not tried."""
+    return Finding(rule, "skip", why)
+
+
+def undecided(rule: str, why: str) -> Finding:
+    """The input has too little data for a verdict."""
+    return Finding(rule, "skip", f"not decided: {why}")
 
 
 @dataclass(frozen=True)
@@ -61,13 +90,7 @@ def load_recorded(adapter: Adapter, root: Path, key: SequenceKey, hands: HandPai
     recorded = {source.path for source in raw.sources}
     unrecorded = tuple(sorted(path for path in opened if not {path, os.path.dirname(path)} & recorded))
     # An error may come before the file it is about was recorded.
-    return Loaded(
-        key=key,
-        results=_without_root(results, root),
-        sources=raw.sources,
-        unrecorded=() if error else unrecorded,
-        error=error,
-    )
+    return Loaded(key, _without_root(results, root), raw.sources, () if error else unrecorded, error=error)
 
 
 def first_difference(one: Any, other: Any, path: str = "") -> str | None:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
-from hoidata.conformance.report import Finding, finding, skipped, undecided
+from hoidata.conformance.loading import Finding, finding, skipped, undecided
 from hoidata.geometry.rotations import rotation_angle, rotvec_to_rotmat
 from hoidata.hands import HandModel, HandPair, track_joints
 from hoidata.objects.distance import closest_points

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from hoidata.clips.clip import Clip
 from hoidata.clips.validation import check_clip
-from hoidata.conformance.loading import Loaded, first_difference, load_recorded
-from hoidata.conformance.report import Finding, finding, skipped, undecided
+from hoidata.conformance.loading import Finding, Loaded, finding, first_difference, load_recorded, skipped, undecided
 from hoidata.datasets.base import Adapter, SequenceKey
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair

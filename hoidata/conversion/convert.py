@@ -82,11 +82,10 @@ def convert_dataset(
         manifest: if given, every file read must be listed with its SHA-256.
         progress: show a progress bar on stderr and the summary on stdout.
         synthetic: the raw data is generated; every clip and the store are marked.
-        stop_on_change: raise for a listed file that is missing or changed. By default its sequences are quarantined.
+        stop_on_change: raise RawFileChanged for a listed file that is missing or changed. By default its sequences are
+            quarantined.
 
-    Raises:
-        BadInput: another run writes ``out``, or the disk is full.
-        RawFileChanged: see ``stop_on_change``.
+    Raises BadInput if another run writes ``out``, or the disk is full.
     """
     hands = hands_for(adapter.hand_convention, hands)
     all_keys = adapter.sequences(Path(root)) if root is not None and Path(root).is_dir() else []
@@ -101,13 +100,7 @@ def convert_dataset(
         raise RawFileChanged(root, "all files that are listed", got, remedy)
     work = FinishedWork(out.with_name(f".{out.name}.work"), root)
     convert = SequenceConverter(
-        adapter=adapter,
-        root=root,
-        hands=hands,
-        manifest=listed,
-        synthetic=synthetic,
-        work=work,
-        stop_on_change=stop_on_change,
+        adapter, root, hands, listed, synthetic=synthetic, work=work, stop_on_change=stop_on_change
     )
     with exclusive(out) as lock:
         remove_leftovers(out)

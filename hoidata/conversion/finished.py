@@ -1,12 +1,11 @@
 """Saves the finished sequences of a conversion next to the store until it is complete, so that a killed run resumes.
 
     .clips.work/job.json             everything that determines the results: adapter, settings, hands, schema, code
-    .clips.work/sequences/<key>.npz  state of the source files when they were read, results and data (see ``Packer``)
+    .clips.work/sequences/<key>.npz  state of the source files when they were read, results and arrays (see ``Packer``)
     .clips.work/shared/<sha256>.npz  a mesh or hand template that several sequences may share
 
 Workers write each file atomically; results never pass between processes. Results are JSON values and arrays, exact in
-every bit, without pickles. A dataclass becomes ``{"kind": name, "fields": ...}``, and an array its dtype, shape and
-offset in one block of bytes.
+every bit, without pickles. A dataclass becomes ``{"kind": name, "fields": ...}``, and an array the name of a member.
 """
 
 import inspect
@@ -45,22 +44,20 @@ KINDS: dict[str, type] = {
     )
 }
 SHARED = {("ObjectModel", "vertices_m"), ("ObjectModel", "faces"), ("ObjectModel", "part"), ("HandTrack", "template_m")}
-_ALIGNMENT = 16
 
 
 class Packer:
-    """Converts values to JSON and collects their arrays in ``blocks``."""
+    """Converts values to JSON and collects their arrays by name."""
 
     def __init__(self, store_shared: Callable[[np.ndarray], str]) -> None:
-        """store_shared: stores an array outside of ``blocks`` and returns its name."""
+        """store_shared: stores an array outside of ``arrays`` and returns its name."""
         self.store_shared = store_shared
-        self.blocks: list[bytes] = []
-        self._length = 0
+        self.arrays: dict[str, np.ndarray] = {}
         self._shared: dict[int, tuple[np.ndarray, str]] = {}
 
     @property
     def shared(self) -> set[str]:
-        """The names of the arrays stored outside of ``blocks``."""
+        """The names of the arrays stored outside of ``arrays``."""
         return {name for _, name in self._shared.values()}
 
     def pack(self, value: Any) -> Any:
@@ -68,7 +65,11 @@ class Packer:
         if value is None or isinstance(value, bool | int | str) or type(value) is float:
             return value
         if isinstance(value, np.ndarray | np.generic):
-            return {"array": self._keep(np.asarray(value)), "scalar": isinstance(value, np.generic)}
+            array, name = np.asarray(value), str(len(self.arrays))
+            if array.dtype.hasobject:
+                raise TypeError("an array of Python objects cannot be part of a clip")
+            self.arrays[name] = array
+            return {"array": name, "scalar": isinstance(value, np.generic)}
         if isinstance(value, dict):
             return {"dict": [[key, self.pack(item)] for key, item in value.items()]}
         if isinstance(value, tuple | list):
@@ -87,50 +88,25 @@ class Packer:
             self._shared[id(value)] = value, self.store_shared(value)
         return {"shared": self._shared[id(value)][1]}
 
-    def _keep(self, array: np.ndarray) -> list[Any]:
-        if array.dtype.hasobject:
-            raise TypeError("an array of Python objects cannot be part of a clip")
-        data = array.tobytes()
-        offset, self._length = self._length, self._length + len(data) + -len(data) % _ALIGNMENT
-        self.blocks.append(data + bytes(-len(data) % _ALIGNMENT))
-        return [array.dtype.str, list(array.shape), offset]
 
+def unpack(value: Any, arrays: Mapping[str, np.ndarray], shared: Callable[[str], np.ndarray]) -> Any:
+    """The inverse of ``Packer.pack``. shared: loads a shared array by its name.
 
-def unpack(value: Any, data: np.ndarray, shared: Callable[[str], np.ndarray]) -> Any:
-    """The inverse of ``Packer.pack``.
-
-    Args:
-        value: returned by ``Packer.pack``.
-        data: (byte,) uint8, the packer's blocks joined.
-        shared: loads a shared array by its name.
-
-    Raises:
-        KeyError, TypeError, ValueError: ``value`` is not from ``Packer.pack``.
+    Raises KeyError, TypeError or ValueError for anything else.
     """
     if not isinstance(value, dict):
         return value
     if "array" in value:
-        return _array(value["array"], data)[()] if value["scalar"] else _array(value["array"], data)
+        return arrays[value["array"]][()] if value["scalar"] else arrays[value["array"]]
     if "shared" in value:
         return shared(value["shared"])
     if "dict" in value:
-        return {key: unpack(item, data, shared) for key, item in value["dict"]}
+        return {key: unpack(item, arrays, shared) for key, item in value["dict"]}
     if "kind" in value:
-        parts = {name: unpack(item, data, shared) for name, item in value["fields"].items()}
+        parts = {name: unpack(item, arrays, shared) for name, item in value["fields"].items()}
         return KINDS[value["kind"]](**parts)
-    items = [unpack(item, data, shared) for item in value["tuple" if "tuple" in value else "list"]]
+    items = [unpack(item, arrays, shared) for item in value["tuple" if "tuple" in value else "list"]]
     return tuple(items) if "tuple" in value else items
-
-
-def _array(stored: list[Any], data: np.ndarray) -> np.ndarray:
-    dtype, shape, offset = np.dtype(stored[0]), stored[1], stored[2]
-    if dtype.hasobject:
-        raise ValueError("an array of Python objects")
-    count = int(np.prod(shape, dtype=np.int64))
-    if not count:
-        return np.zeros(shape, dtype)
-    # A copy: a view would keep the data of the whole sequence as long as one of its arrays lives.
-    return np.frombuffer(data, dtype, count, offset).reshape(shape).copy()
 
 
 # Packages and modules of hoidata that a conversion runs; the digest of code also covers the adapter's file.
@@ -185,11 +161,8 @@ class FinishedWork:
         try:
             packed = packer.pack(results)
             state = None if sources is None else self._state([source.path for source in sources])
-            members = {
-                "sources": _text(canonical_json({"state": state, "shared": sorted(packer.shared)})),
-                "results": _text(json.dumps(packed)),
-                "data": np.frombuffer(b"".join(packer.blocks), np.uint8),
-            }
+            facts = _text(canonical_json({"state": state, "shared": sorted(packer.shared)}))
+            members = {"sources": facts, "results": _text(json.dumps(packed)), **packer.arrays}
             write_npz(self._file(key), members)
         except OSError as error:
             remedy = "make room there and run again: finished sequences are kept"
@@ -210,7 +183,7 @@ class FinishedWork:
     def read(self, key: SequenceKey) -> list[Item]:
         """The results of one finished sequence, equal in every bit to those that were saved."""
         arrays = read_npz(self._file(key))
-        return unpack(json.loads(arrays["results"].tobytes()), arrays["data"], self._shared)
+        return unpack(json.loads(arrays["results"].tobytes()), arrays, self._shared)
 
     def _file(self, key: SequenceKey) -> Path:
         return self.folder / "sequences" / f"{sha256_bytes(str(key).encode())[:32]}.npz"

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from operator import attrgetter
 from pathlib import Path
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from hoidata.clips.clip import Clip, SourceFile, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention
@@ -132,18 +132,9 @@ class Adapter(Protocol):
         ...
 
     def load(self, raw: "RawTree", key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
-        """Load and convert one sequence.
+        """Load and convert one sequence: its clips, and a ``Quarantined`` for every interval that gives no clip.
 
-        Args:
-            raw: the raw folder; the adapter opens every file through it.
-            key: one of ``sequences``.
-            hands: hand models of both sides, which turn hand parameters into joints.
-
-        Returns:
-            The clips, and a ``Quarantined`` with the reason for every interval that gives no clip.
-
-        Raises:
-            BadInput: the whole sequence is unusable.
+        The adapter opens every file through ``raw``. Raises BadInput if the whole sequence is unusable.
         """
         ...
 
@@ -186,6 +177,11 @@ class AdapterBase:
     def source_fps(self) -> float:
         return float(self.facts.source_fps)
 
+    def new_clip(self, key: SequenceKey, **fields: Any) -> Clip:
+        """A clip of a sequence. Unless given, its id is the key, and its frame rate that of the source."""
+        origin = {"dataset": self.name, "subject": key.subject, "sequence": key.name}
+        return Clip(**{"clip_id": str(key), **origin, "source_fps": self.source_fps, **fields})
+
 
 @dataclass
 class RawTree:
@@ -226,13 +222,10 @@ class RawTree:
         return data
 
     def read_folder(self, folder: str, names: Iterable[str]) -> list[bytes]:
-        """Read many small files of one folder and record the folder as one source.
+        """Read many small files of one folder, in the order of ``names``, and record the folder as one source.
 
         The folder's digest is the SHA-256 of one ``<sha256>  <name>`` line per file, and its size is the sum.
         A manifest lists either the files or the folder.
-
-        Returns:
-            The bytes of each file, in the order of ``names``.
         """
         contents, lines = [], []
         listed = self.manifest is not None and folder not in self.manifest

@@ -13,17 +13,9 @@ BODY_COLUMNS = {"transl": 3, "global_orient": 3, "body_pose": 63, "jaw_pose": 3,
 
 
 def table(location: str, value: Any, columns: int, rows: int | None = None, row_name: str = "frames") -> np.ndarray:
-    """Convert ``value`` to a finite float64 array of shape (rows, columns).
+    """Convert nested lists or an array to a finite float64 array of shape (rows, columns); else raise BadInput.
 
-    Args:
-        location: file and entry, for errors.
-        value: nested lists or an array.
-        columns: required number of columns.
-        rows: required number of rows; None accepts any number from 1.
-        row_name: what errors call the rows.
-
-    Raises:
-        BadInput: another shape or type, NaN or infinity.
+    location: file and entry, for errors. rows: required number; None accepts any number from 1. row_name: for errors.
     """
     try:
         array = np.asarray(value)
@@ -49,14 +41,7 @@ def finite(location: str, array: np.ndarray) -> None:
 
 
 def body_track(location: str, params: Any, n_frames: int, further: Mapping[str, int] | None = None) -> BodyTrack:
-    """The parameters of the person's SMPL-X body, float32.
-
-    Args:
-        location: file and entry, for errors.
-        params: entries of ``BODY_COLUMNS``, each (frame, column).
-        n_frames: required number of frames.
-        further: number of columns of further entries that only this source has.
-    """
+    """The person's SMPL-X body, float32. params: entries of ``BODY_COLUMNS`` and ``further``, each (frame, column)."""
     values = {
         name: table(f"{location}: {name}", entry(location, params, name), columns, n_frames).astype(np.float32)
         for name, columns in {**BODY_COLUMNS, **(further or {})}.items()
@@ -66,14 +51,9 @@ def body_track(location: str, params: Any, n_frames: int, further: Mapping[str, 
 
 
 def rigid_transforms(folder: str, names: Sequence[str], matrices: np.ndarray) -> None:
-    """Raise BadInput unless all matrices are rigid transforms of column vectors, to 1e-3.
+    """Raise BadInput unless all matrices (frame, 4, 4) are rigid transforms of column vectors, to 1e-3.
 
-    Detects transposed matrices, because these have the translation in the last row.
-
-    Args:
-        folder: of the files, for errors.
-        names: file of each frame, for errors.
-        matrices: (frame, 4, 4).
+    Detects transposed matrices, because these have the translation in the last row. names: file of each frame.
     """
     rotation, last_row = matrices[:, :3, :3], matrices[:, 3]
     rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))

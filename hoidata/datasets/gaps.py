@@ -34,9 +34,7 @@ def has_pose(tracked: np.ndarray) -> np.ndarray:
 def bridge(track: ObjectTrack, tracked: np.ndarray) -> ObjectTrack:
     """Interpolate gaps of at most three frames by cubic splines through the frames around each gap.
 
-    Args:
-        track: at 30 fps; poses of untracked frames are ignored.
-        tracked: (frame,) bool.
+    track: at 30 fps; poses of untracked frames are ignored. tracked: (frame,) bool.
     """
     values = {"rotvec": track.rotvec.copy(), "translation_m": track.translation_m.copy()}
     if track.hinge_rad is not None:
@@ -63,12 +61,7 @@ def trim_to_recorded(interval: tuple[int, int], recorded: np.ndarray) -> Interva
 def mark_interpolated(source_frames: np.ndarray, recorded: np.ndarray) -> np.ndarray:
     """Give each interpolated frame the source number of the recorded frame before it: see ``Clip.recorded``.
 
-    Args:
-        source_frames: (frame,) numbers in the source.
-        recorded: (frame,) bool, True in the first frame.
-
-    Returns:
-        (frame,) source numbers.
+    source_frames: (frame,) numbers in the source. recorded: (frame,) bool, True in the first frame.
     """
     return np.maximum.accumulate(np.where(recorded, source_frames, source_frames[0]))
 
@@ -76,17 +69,9 @@ def mark_interpolated(source_frames: np.ndarray, recorded: np.ndarray) -> np.nda
 def missing_poses(
     source_key: str, location: str, object_name: str, source_frames: np.ndarray, tracked: np.ndarray
 ) -> list[Quarantined]:
-    """Report gaps of more than three frames between tracked frames.
+    """One reason that lists the gaps of more than three frames between tracked frames; none without such gaps.
 
-    Args:
-        source_key: of the reason.
-        location: file, for the reason.
-        object_name: for the reason.
-        source_frames: (frame,) numbers in the source.
-        tracked: (frame,) bool.
-
-    Returns:
-        One reason that lists the gaps; empty without such gaps.
+    source_frames: (frame,) numbers in the source. tracked: (frame,) bool.
     """
     tracked_frames = np.flatnonzero(tracked)
     if not len(tracked_frames):

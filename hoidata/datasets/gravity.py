@@ -75,10 +75,8 @@ def estimate_gravity(
 ) -> GravityEstimate:
     """Estimate gravity of one recording whose world is static.
 
-    Args:
-        objects: of the recording.
-        joints_m: (frame, joint, 3) joints of both hands in the world, NaN if a hand is not tracked.
-        camera_rotation: (frame, 3, 3) world from a head-worn camera with OpenCV axes.
+    joints_m: (frame, joint, 3) joints of both hands in the world, NaN if a hand is not tracked. camera_rotation:
+    (frame, 3, 3) world from a head-worn camera with OpenCV axes.
     """
     rests = [
         rest for tracked_object in objects for rest in _resting_intervals(tracked_object, joints_m, camera_rotation)

@@ -47,15 +47,7 @@ class HingeFit(NamedTuple):
 
 
 def rigid_fit(from_m: np.ndarray, to_m: np.ndarray) -> np.ndarray:
-    """Least-squares rigid transforms between corresponding points (Kabsch 1976).
-
-    Args:
-        from_m: (frame, point, 3).
-        to_m: (frame, point, 3).
-
-    Returns:
-        (frame, 4, 4) transforms that take ``from_m`` closest to ``to_m``.
-    """
+    """Least-squares rigid transforms (frame, 4, 4) between corresponding points (frame, point, 3) (Kabsch 1976)."""
     from_mean, to_mean = from_m.mean(axis=1, keepdims=True), to_m.mean(axis=1, keepdims=True)
     u, _, vt = np.linalg.svd((to_m - to_mean).transpose(0, 2, 1) @ (from_m - from_mean))
     signs = np.ones((len(u), 3))  # excludes reflections
@@ -70,13 +62,8 @@ def fit_hinge(base: np.ndarray, moving: np.ndarray, hinge: Hinge, corners_m: tup
     """Fit one object pose and one hinge angle per frame to two separately tracked parts.
 
     Alternates two steps: the angle of the relative rotation about the axis, and the pose closest to the corners of both
-    parts.
-
-    Args:
-        base: (frame, 4, 4) world from base, in the coordinates of the whole object at rest.
-        moving: (frame, 4, 4) world from moving part, in the same coordinates.
-        hinge: of the whole object.
-        corners_m: (8, 3) box corners of each part at rest.
+    parts. base, moving: (frame, 4, 4) world from part, in the coordinates of the whole object at rest. corners_m: (8,
+    3) box corners of each part at rest.
     """
     tracked_m = np.concatenate([_transformed(base, corners_m[0]), _transformed(moving, corners_m[1])], axis=1)
     pose = base
@@ -93,13 +80,9 @@ def fit_hinge(base: np.ndarray, moving: np.ndarray, hinge: Hinge, corners_m: tup
 
 
 def find_hinge(base_from_part: np.ndarray) -> Hinge | None:
-    """Estimate the common axis of a part's rotations relative to its base.
+    """Estimate the common axis of a part's rotations relative to its base; its largest component is positive.
 
-    Args:
-        base_from_part: (frame, 4, 4), relative to the pose at rest.
-
-    Returns:
-        The hinge, whose axis has a positive largest component; None if the part rotates by less than 15 degrees.
+    base_from_part: (frame, 4, 4), relative to the pose at rest. None if the part rotates by less than 15 degrees.
     """
     rotvec = rotmat_to_rotvec(base_from_part[:, :3, :3])
     axis = np.linalg.eigh(rotvec.T @ rotvec)[1][:, -1]
@@ -116,19 +99,11 @@ def find_hinge(base_from_part: np.ndarray) -> Hinge | None:
 def hinge_between(
     base: np.ndarray, base_from_part: np.ndarray, corners_m: tuple[np.ndarray, np.ndarray], most_mm: int, most_deg: int
 ) -> tuple[Hinge, HingeFit] | None:
-    """Estimate the hinge between two separately tracked parts.
+    """Estimate the hinge between two separately tracked parts, and fit it.
 
-    Frames whose residuals exceed the limits are excluded from a second estimate.
-
-    Args:
-        base: (frame, 4, 4) world from base.
-        base_from_part: (frame, 4, 4), relative to the pose at rest.
-        corners_m: (8, 3) box corners of each part at rest.
-        most_mm: limit of the position residual.
-        most_deg: limit of the rotation residual.
-
-    Returns:
-        Hinge and fit. None if the parts rotate too little, or if more than 5 % of the frames exceed a limit.
+    Frames whose residuals exceed the limits are excluded from a second estimate. None if the parts rotate too little,
+    or if more than 5 % of the frames exceed a limit. base: (frame, 4, 4) world from base. base_from_part: (frame, 4,
+    4), relative to the pose at rest. corners_m: (8, 3) box corners of each part at rest.
     """
     used_frames = np.ones(len(base), bool)
     for _ in range(2):
@@ -145,11 +120,7 @@ def hinged_model(name: str, vertices_m: list[np.ndarray], faces: list[np.ndarray
     counts = [len(vertices) for vertices in vertices_m]
     part = np.repeat(np.array([0, 1], np.uint8), counts)
     return ObjectModel(
-        name=name,
-        vertices_m=np.concatenate(vertices_m),
-        faces=np.concatenate([faces[0], faces[1] + counts[0]]),
-        part=part,
-        hinge=hinge,
+        name, np.concatenate(vertices_m), np.concatenate([faces[0], faces[1] + counts[0]]), part, hinge=hinge
     )
 
 

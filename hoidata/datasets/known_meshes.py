@@ -12,12 +12,9 @@ _cache: OrderedDict[tuple[str, str], Mesh] = OrderedDict()
 
 
 def raw_mesh(raw: RawTree, path: str) -> Mesh:
-    """Read a mesh with ``load_mesh`` through ``raw``, from the cache if its bytes are known.
+    """Read a mesh with ``load_mesh`` through ``raw``, from the cache if its bytes are known; the caller may change it.
 
     The cache key is SHA-256 and file extension. Above ``MAX_CACHE_BYTES`` the least recently used meshes are dropped.
-
-    Returns:
-        Copies of the cached arrays, which the caller may change.
     """
     file = raw.file(path)
     (source,) = raw.recorded(path)

@@ -45,15 +45,9 @@ def registered_adapters() -> list[Registered]:
 
 
 def get_adapter(name: str, **settings: Any) -> Adapter:
-    """Create the adapter of a dataset.
+    """Create the adapter of a dataset. settings: its dataclass fields, except those that state facts.
 
-    Args:
-        name: of the dataset.
-        settings: values of the adapter's dataclass fields; fields that state facts are excluded.
-
-    Raises:
-        MissingResource: there is no such adapter, or its package is broken.
-        BadInput: the adapter has no such setting.
+    Raises MissingResource for an unknown adapter or a broken package, BadInput for an unknown setting.
     """
     kind = _adapter_class(name)
     defaults = _settings(kind)

@@ -20,6 +20,7 @@ from hoidata.contact.proximity import ProximityIndex
 from hoidata.contact.settings import ContactSettings
 from hoidata.datasets.base import RawTree
 from hoidata.datasets.gaps import trim_to_recorded
+from hoidata.errors import BadInput
 from hoidata.geometry.intervals import Interval, bridged, runs
 from hoidata.geometry.rotations import rotation_angle
 from hoidata.hands import HandPair, track_joints
@@ -40,23 +41,6 @@ LIFTED_M = 0.08  # an object that rises and sinks by this much is lifted and the
 # The setting ``clips`` of adapters with descriptions: one clip per described action, the whole recording, its segments,
 # or the segments of recordings without a description.
 ClipSource = Literal["described", "whole", "segments", "described-else-segments"]
-Event = Literal["approach", "articulation", "hand change", "carrying", "top of a lift", "slow frame", "release"]
-
-
-class Cut(NamedTuple):
-    """The first frame of a segment, and the event that begins there."""
-
-    frame: int
-    event: Event
-
-
-class Segment(NamedTuple):
-    """Frames ``start`` to ``stop`` (half-open) of a recording, and the events at both ends."""
-
-    start: int
-    stop: int
-    begins_with: Event
-    ends_with: Event
 
 
 class ObjectSignals(NamedTuple):
@@ -90,23 +74,18 @@ def _segments_of(recording: Clip, hands: HandPair) -> Iterator[Clip | Quarantine
     evidence = find_active_hands(recording, joints_m, ProximityIndex(points), settings.threshold_m)
     if evidence.hand_type is None:
         expected = f"a hand within {settings.threshold_m * 100:g} cm of the object"
-        yield Quarantined(
-            recording.clip_id,
-            where=recording.sequence,
-            expected=expected,
-            got="none in any frame",
-            remedy="nothing to do",
-        )
+        problem = BadInput(recording.sequence, expected, "none in any frame", "nothing to do")
+        yield Quarantined.from_error(recording.clip_id, problem)
     elif recording.n_frames <= LONGEST_FRAMES:
         yield recording
     else:
         for segment in find_segments(recording, evidence):
-            clip = recording.take(slice(*trim_to_recorded((segment.start, segment.stop), recording.recorded)))
+            clip = recording.take(slice(*trim_to_recorded(segment, recording.recorded)))
             first, last = int(clip.source_frames[0]) + 1, int(clip.source_frames[-1]) + 1
             yield replace(clip, clip_id=f"{recording.clip_id}/{first:04d}-{last:04d}")
 
 
-def find_segments(recording: Clip, evidence: HandEvidence) -> list[Segment]:
+def find_segments(recording: Clip, evidence: HandEvidence) -> list[Interval]:
     """The segments of a recording, disjoint and in order: at most 150 frames each, with contact in each.
 
     Every contact of a hand with the object lies in segments, with up to half a second of approach and release. A
@@ -118,51 +97,49 @@ def find_segments(recording: Clip, evidence: HandEvidence) -> list[Segment]:
     near: dict[Side, np.ndarray] = {side: bridged(evidence.near(side), LOST_FRAMES) for side in SIDES}
     contacts = runs(bridged(near["left"] | near["right"], LOST_FRAMES))
     next_starts = [*(contact.start for contact in contacts[1:]), recording.n_frames]
-    segments: list[Segment] = []
+    segments: list[Interval] = []
     for contact, next_start in zip(contacts, next_starts, strict=False):
         start = max(contact.start - MARGIN_FRAMES, segments[-1].stop if segments else 0)
         stop = min(contact.stop + MARGIN_FRAMES, next_start)
         cuts = chosen_cuts(contact, _candidates(signals, near))
-        cuts = _divided([Cut(start, "approach"), *cuts, Cut(stop, "release")], signals.speed_m)
-        segments += [Segment(cut.frame, after.frame, cut.event, after.event) for cut, after in pairwise(cuts)]
+        segments += [Interval(*ends) for ends in pairwise(_divided([start, *cuts, stop], signals.speed_m))]
     return segments
 
 
-def _candidates(signals: ObjectSignals, near: Mapping[Side, np.ndarray]) -> Iterator[Cut]:
-    """Possible cuts, the most important kind first."""
+def _candidates(signals: ObjectSignals, near: Mapping[Side, np.ndarray]) -> Iterator[int]:
+    """Frames of possible cuts, the most important kind first."""
     for interval in runs(signals.is_articulated):
-        yield from (Cut(frame, "articulation") for frame in interval)
+        yield from interval
         if signals.hinge_rad is not None:
             reversals = turning_points(signals.hinge_rad[slice(*interval)], REVERSED_RAD)
-            yield from (Cut(interval.start + frame, "articulation") for frame in reversals)
+            yield from (interval.start + frame for frame in reversals)
     for flags in near.values():
-        yield from (Cut(frame, "hand change") for interval in runs(flags) for frame in interval)
+        yield from (frame for interval in runs(flags) for frame in interval)
     for interval in runs(signals.is_carried):
-        yield from (Cut(frame, "carrying") for frame in interval)
+        yield from interval
         if signals.height_m is not None:
             tops = turning_points(signals.height_m[slice(*interval)], LIFTED_M)
-            yield from (Cut(interval.start + frame, "top of a lift") for frame in tops)
+            yield from (interval.start + frame for frame in tops)
 
 
-def chosen_cuts(contact: Interval, candidates: Iterator[Cut]) -> list[Cut]:
+def chosen_cuts(contact: Interval, candidates: Iterator[int]) -> list[int]:
     """The candidates at least a second from both ends of the contact and from each other; the first ones win."""
-    chosen: list[Cut] = []
+    chosen: list[int] = []
     for cut in candidates:
-        boundaries = [*contact, *(other.frame for other in chosen)]
-        is_inside = contact.start < cut.frame < contact.stop
-        if is_inside and min(abs(cut.frame - frame) for frame in boundaries) >= SHORTEST_FRAMES:
+        is_inside = contact.start < cut < contact.stop
+        if is_inside and min(abs(cut - frame) for frame in (*contact, *chosen)) >= SHORTEST_FRAMES:
             chosen.append(cut)
     return sorted(chosen)
 
 
-def _divided(cuts: list[Cut], speed_m: np.ndarray) -> list[Cut]:
+def _divided(cuts: list[int], speed_m: np.ndarray) -> list[int]:
     """The cuts, with further ones at slow frames, so that no segment is longer than 150 frames."""
     divided = cuts[:1]
     for cut in cuts[1:]:
-        while (left := cut.frame - divided[-1].frame) > LONGEST_FRAMES:
-            latest = divided[-1].frame + min(LONGEST_FRAMES, left - SHORTEST_FRAMES)
-            earliest = max(divided[-1].frame + SHORTEST_FRAMES, latest - LONGEST_FRAMES // 2)
-            divided.append(Cut(earliest + int(np.argmin(speed_m[earliest : latest + 1])), "slow frame"))
+        while (left := cut - divided[-1]) > LONGEST_FRAMES:
+            latest = divided[-1] + min(LONGEST_FRAMES, left - SHORTEST_FRAMES)
+            earliest = max(divided[-1] + SHORTEST_FRAMES, latest - LONGEST_FRAMES // 2)
+            divided.append(earliest + int(np.argmin(speed_m[earliest : latest + 1])))
         divided.append(cut)
     return divided
 

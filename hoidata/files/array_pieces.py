@@ -54,8 +54,7 @@ class StoredArray:
     def pieces(self) -> Iterator[tuple[int, np.ndarray]]:
         """Iterate over pieces of about 4 MB: index of the first row, and rows (columns if ``by_columns``).
 
-        Raises:
-            BadInput: the archive is damaged.
+        Raises BadInput for a damaged archive.
         """
         count, length = self.shape[::-1] if self.by_columns else self.shape
         step = max(1, _PIECE_BYTES // max(1, length * self.dtype.itemsize))
@@ -87,8 +86,7 @@ def npz_members(path: str | Path) -> set[str]:
 def locate_arrays(path: str | Path, member: str) -> dict[str, StoredArray]:
     """Locate the 2-d numeric arrays in the pickled dict of an ``.npz`` member, without reading their data.
 
-    Raises:
-        BadInput: the member is missing, is not a dict, could run code, or is damaged.
+    Raises BadInput if the member is missing, is not a dict, could run code, or is damaged.
     """
     source = f"{path}: {member}"
     if member not in npz_members(path):

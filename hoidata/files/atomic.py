@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import psutil
 from filelock import FileLock, Timeout
 
 from hoidata.errors import BadInput
@@ -109,26 +110,16 @@ def _writer() -> str:
 
 def _is_dead(name: str) -> bool:
     """Whether the writer in a temporary file's name is a process of this machine that has ended."""
-    writer = re.search(rf"\.{_machine()}-([0-9]+)-[^.]+\.(part|old)$", name)
-    if not writer:
-        return False
-    try:
-        os.kill(int(writer[1]), 0)
-    except ProcessLookupError:
-        return True
-    except (PermissionError, OverflowError):
-        return False
-    return False
+    writer = re.search(rf"\.{_machine()}-([0-9]{{1,9}})-[^.]+\.(part|old)$", name)
+    return writer is not None and not psutil.pid_exists(int(writer[1]))
 
 
 @contextmanager
 def exclusive(path: str | Path, wait_s: float = _WAIT_S) -> Iterator[int]:
     """Lock ``path`` for writing. Yields the file descriptor of the lock file ``.<name>.lock`` next to it.
 
-    The system releases the lock when the last process with the descriptor ends.
-
-    Raises:
-        BadInput: another process still has the lock after ``wait_s`` seconds.
+    The system releases the lock when the last process with the descriptor ends. Raises BadInput if another process
+    still has the lock after ``wait_s`` seconds.
     """
     path, descriptors = Path(path), []
     path.parent.mkdir(parents=True, exist_ok=True)

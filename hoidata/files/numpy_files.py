@@ -35,9 +35,8 @@ def load_npy_object(path: str | Path) -> Any:
 def load_npz_objects(path: str | Path, members: Collection[str] | None = None) -> dict[str, Any]:
     """Read members of an ``.npz`` file (all by default), 0-d arrays as their item, such as GRAB's sequence files.
 
-    Raises:
-        BadInput: a member is absent, there are more than 256 members, or they unpack to more than 1 GiB, or to more
-            than both 64 MiB and eight times the file.
+    Raises BadInput if a member is absent, there are more than 256 members, or they unpack to more than 1 GiB, or to
+    more than both 64 MiB and eight times the file.
     """
     with open_archive(path) as archive:
         chosen = _chosen_members(path, archive, members)
@@ -48,9 +47,8 @@ def load_npz_objects(path: str | Path, members: Collection[str] | None = None) -
 def load_npz_arrays(path: str | Path) -> dict[str, np.ndarray]:
     """Read all members of an ``.npz`` file of plain arrays, which hoidata wrote, of any size.
 
-    Raises:
-        BadInput: it has Python objects, or unpacks to more than both the file's size and the limit of
-            ``load_npz_objects``.
+    Raises BadInput for Python objects, or if it unpacks to more than both the file's size and the limit of
+    ``load_npz_objects``.
     """
     with open_archive(path) as archive:
         infos = archive.infolist()

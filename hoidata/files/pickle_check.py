@@ -47,12 +47,8 @@ class OpcodeLimit:
 def check_opcodes(data: bytes, limit: OpcodeLimit | None = None) -> None:
     """Refuse unneeded opcodes, memo indices beyond the file's length, and keys that are slow to hash or compare.
 
-    Args:
-        data: the pickle.
-        limit: budget of the file with the pickle; by default ``data`` is the whole file.
-
-    Raises:
-        UnpicklingError: the pickle is refused. For malformed pickles, pickletools raises other exceptions too.
+    limit: budget of the file with the pickle; by default ``data`` is the whole file. Raises UnpicklingError; for
+    malformed pickles, pickletools raises other exceptions too.
     """
     walk, limit = _StackSimulation(), limit or OpcodeLimit(len(data))
     for opcode, argument, _ in pickletools.genops(data):

@@ -38,7 +38,7 @@ def restricted_load(
     max_bytes: int = MAX_BYTES,
     archive: "StoredSize | None" = None,
 ) -> Any:
-    """Unpickle data with only the globals of an allow-list; arrays become plain ``numpy.ndarray``.
+    """Unpickle data with only the globals of an allow-list; arrays become plain ``numpy.ndarray``. Else raise BadInput.
 
     Args:
         source: the pickle.
@@ -47,9 +47,6 @@ def restricted_load(
         path: names the file in errors.
         max_bytes: limit of the pickle's size.
         archive: shared limits of all pickles in one compressed file.
-
-    Raises:
-        BadInput: the pickle is malformed, too large or not allowed.
     """
     data = source if isinstance(source, bytes) else read_at_most(source, max_bytes + 1)
     if len(data) > max_bytes:
@@ -147,10 +144,8 @@ class _Callable(StandIn):
 def _expanded_size(value: Any, sizes: dict[int, int | None], limit: int) -> int:
     """Size of a value in bytes if shared items are copied, as NumPy does for an array of nested lists.
 
-    A pickle of a few hundred bytes can contain one list 2^60 times. ``sizes`` caches sizes by id.
-
-    Raises:
-        UnpicklingError: the size exceeds ``limit``, or the value contains itself.
+    A pickle of a few hundred bytes can contain one list 2^60 times. ``sizes`` caches sizes by id. Raises
+    UnpicklingError if the size exceeds ``limit``, or the value contains itself.
     """
     if isinstance(value, str | bytes | bytearray):
         return len(value)

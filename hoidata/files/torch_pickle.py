@@ -63,16 +63,8 @@ _COMMON_STORAGE = re.compile(
 def load_torch_pickle(source: str | Path | bytes, path: str | Path, arrays: bool = False) -> Any:
     """Load a plain pickle of torch tensors, parameters and ordered dictionaries in dicts, lists and tuples.
 
-    Args:
-        source: path or bytes of the file.
-        path: names the file in errors.
-        arrays: allow NumPy arrays too.
-
-    Returns:
-        The object, with a separate ``numpy.ndarray`` for each tensor.
-
-    Raises:
-        BadInput: other globals, other storage types, tensors that exceed their storage, or files over 256 MiB.
+    Each tensor becomes a separate ``numpy.ndarray``. arrays: allow NumPy arrays too. Raises BadInput for other globals,
+    other storage types, tensors that exceed their storage, or files over 256 MiB.
     """
     try:
         stream = io.BytesIO(source) if isinstance(source, bytes) else open(source, "rb")  # noqa: SIM115

@@ -4,7 +4,7 @@ A predicted clip is named ``<reference id>~<k>`` with k = 0, 1, ..., or just ``<
 belongs to repetition k of the experiment. A prediction is in the world frame of its reference. It has all frames of the
 reference or a contiguous part, identified by ``source_frames``.
 
-If ``meta/info.json`` has ``windows``, the references are windows of the clips (``hoidata.store.windows``).
+If ``meta/info.json`` has ``windows``, the references are windows of the clips (``hoidata.store.annotated``).
 
 If it has ``"length": "own"``, the family chose the length of every motion of the store. Then nothing is
 compared frame by frame, hands are measured where the prediction has them, and the length itself is measured.
@@ -37,10 +37,9 @@ from hoidata.metrics.unmeasured import CHOSEN_LENGTH, Values
 from hoidata.objects.model import ObjectModel
 from hoidata.physics.scene import object_scene
 from hoidata.settings import build_config
-from hoidata.store.annotated import AnnotatedStore, load_annotated
+from hoidata.store.annotated import AnnotatedStore, WindowedStore, WindowProtocol, load_annotated
 from hoidata.store.distances import DistanceEntries
 from hoidata.store.store import Store, open_store
-from hoidata.store.windows import WindowedStore, WindowProtocol
 from hoidata.workers import map_in_workers
 
 SAME_MESH_M = 1e-5  # above the float32 rounding of metres

@@ -134,16 +134,9 @@ def missing_parts(clips: Mapping[str, int]) -> dict[str, str]:
 def assign_split(sequences: pd.DataFrame, rule: SplitRule) -> pd.Series:
     """Assign each clip to "train", "validation", "test" or None (excluded), whatever the order of the clips.
 
-    Args:
-        sequences: a store's ``sequences`` table. The columns clip_id, subject, object, other_objects, sequence,
-            first_source_frame and last_source_frame are used, and verb and hand_type of the annotation.
-        rule: how to split.
-
-    Returns:
-        The part of each clip, under the index of ``sequences``.
-
-    Raises:
-        BadInput: too few clips can be held out.
+    sequences: a store's ``sequences`` table, whose index the result has. The columns clip_id, subject, object,
+    other_objects, sequence, first_source_frame and last_source_frame are used, and verb and hand_type of the
+    annotation. Raises BadInput if too few clips can be held out.
     """
     clips = sequences.reset_index(drop=True)
     if rule.by in IN_TIME:
@@ -252,7 +245,8 @@ def _in_time(clips: pd.DataFrame, rule: SplitRule) -> list[Part | None]:
     parts: list[Part | None] = [None] * len(clips)
     ordered = clips.sort_values(["sequence", "first_source_frame", "clip_id"], kind="stable")
     for _, group in ordered.groupby("sequence"):
-        group_parts = _by_rounds(len(group)) if rule.by == "rounds" else _by_share(len(group), rule)
+        rounds = [ROUND[number % len(ROUND)] for number in range(len(group))]
+        group_parts = rounds if rule.by == "rounds" else _by_share(len(group), rule)
         for clip, part in zip(group.index, group_parts, strict=True):
             parts[clip] = part
     return parts
@@ -285,10 +279,6 @@ def _drawn_per_object(clips: pd.DataFrame, rule: SplitRule) -> dict[str, Part]:
     return parts
 
 
-def _by_rounds(n_clips: int) -> Sequence[Part]:
-    return [ROUND[index % len(ROUND)] for index in range(n_clips)]
-
-
 def hold_out(
     groups: Sequence[str], components: Sequence[Iterable[Hashable]], fractions: Mapping[str, float]
 ) -> dict[str, str]:
@@ -297,13 +287,8 @@ def hold_out(
     Greedy: the next group is one that brings a part closer to its size. Among these it is the group whose most held-out
     component is held out the least, never completely. The SHA-256 of the name decides between equal groups.
 
-    Args:
-        groups: group of each clip.
-        components: of each clip, what training must also have if the clip is held out.
-        fractions: by part, the fraction of all clips that it gets.
-
-    Returns:
-        The part of each held-out group.
+    groups, components: of each clip. fractions: by part, the fraction of all clips that it gets. Returns the part of
+    each held-out group.
     """
     counts: dict[str, Counter[Hashable]] = defaultdict(Counter)
     for group, items in zip(groups, components, strict=True):
@@ -334,10 +319,7 @@ def without_shared_frames(
 ) -> list[str | None]:
     """Exclude clips (None) that share frames with a clip of a part that is earlier in ``order``.
 
-    Args:
-        spans: sequence, first and last source frame of each clip.
-        parts: part of each clip.
-        order: parts, those that keep their clips first.
+    spans: sequence, first and last source frame of each clip.
     """
     used: dict[Hashable, list[tuple[int, int, str]]] = defaultdict(list)
     disjoint: list[str | None] = [None] * len(spans)

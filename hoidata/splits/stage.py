@@ -24,8 +24,7 @@ from hoidata.clips.clip import SIDES, Clip
 from hoidata.errors import BadInput
 from hoidata.files import atomic_folder
 from hoidata.files.written import read_table, write_table
-from hoidata.splits.definitions import Definition, choose, definitions_for, published
-from hoidata.splits.leaks import Leaks, find_leaks
+from hoidata.splits.definitions import Definition, Leaks, choose, definitions_for, find_leaks, published
 from hoidata.splits.rules import PARTS, assign_split, missing_parts
 from hoidata.splits.statistics import training_statistics
 from hoidata.store.store import Store, open_store
@@ -42,19 +41,9 @@ def split_store(
 ) -> dict[str, int]:
     """Split the annotated clips of a store; the folder appears whole or not at all.
 
-    Only clips with sentences are split, because no model uses the others.
-
-    Args:
-        clips_folder: the store.
-        annotation_folder: output of the stage annotate.
-        out_folder: folder to write.
-        choice: name of a split, or a custom rule (see ``choose``).
-
-    Returns:
-        Number of clips of each part of the chosen split.
-
-    Raises:
-        BadInput: two parts of the chosen split share what it promises to keep apart.
+    Only clips with sentences are split, because no model uses the others. choice: name of a split, or a custom rule
+    (see ``choose``). Returns the number of clips of each part of the chosen split. Raises BadInput if two of its parts
+    share what it promises to keep apart.
     """
     store = open_store(clips_folder)
     hand_types, used = _annotated_clips(store, Path(annotation_folder))

@@ -30,11 +30,7 @@ def training_statistics(store: Store, train: Sequence[str], hand_types: pd.DataF
     """Compute count, mean, standard deviation, extremes and quantiles of each quantity over the training clips.
 
     Invalid frames of a hand and the hinge of rigid objects are skipped. A quantity without values has a count of 0.
-
-    Args:
-        store: the clips.
-        train: ids of the training clips.
-        hand_types: the annotation's table under clip ids, for the closest approach of each hand.
+    hand_types: the annotation's table under clip ids, for the closest approach of each hand.
     """
     quantities: dict[str, Any] = {}
     for group in (*(_hand_quantities(side) for side in SIDES), _object_quantities()):  # one group in memory at a time

@@ -56,34 +56,36 @@ def _both(field: Field) -> tuple[Field, ...]:
     )
 
 
+def _array(
+    name: str, dtype: str, axes: str, meaning: str, unit: str = "", frame: str = "", required: bool = True
+) -> Field:
+    """A field with axes. axes: what each counts, and its length if that is fixed: ``frame, xyz:3``."""
+    parts = [axis.partition(":") for axis in axes.split(", ")]
+    shape, counts = tuple(int(length or 0) or count for count, _, length in parts), tuple(part[0] for part in parts)
+    return Field(name, dtype, meaning, shape, axes=counts, unit=unit, frame=frame, required=required)
+
+
 def _rotvec(name: str, rows: str, meaning: str) -> Field:
-    return Field(name, "float32", meaning, shape=(rows, 3), axes=(rows, "axis-angle"), unit="radian", frame="world")
+    return _array(name, "float32", f"{rows}, axis-angle:3", meaning, "radian", "world")
 
 
 def _point(name: str, rows: str, meaning: str) -> Field:
-    return Field(name, "float32", meaning, shape=(rows, 3), axes=(rows, "xyz"), unit="metre", frame="world")
+    return _array(name, "float32", f"{rows}, xyz:3", meaning, "metre", "world")
 
 
 def _angles(name: str, rows: str, joints: int, meaning: str) -> Field:
-    axes = (rows, "joint x axis-angle")
-    return Field(name, "float32", meaning, shape=(rows, 3 * joints), axes=axes, unit="radian", frame="parent joint")
+    return _array(name, "float32", f"{rows}, joint x axis-angle:{3 * joints}", meaning, "radian", "parent joint")
 
 
 def _hand(side: str) -> tuple[Field, ...]:
-    betas = Field(
-        f"{side}_betas", "float32", "MANO shape", shape=(f"{side} betas row", 10), axes=("betas row", "component")
-    )
+    untracked = "False: the hand is not tracked; its numbers are finite but meaningless"
+    shape, axes = (f"{side} betas row", 10), ("betas row", "component")
     return (
         _point(f"{side}_wrist_m", "frame", f"position of joint 0 of the {side} hand; not MANO's transl"),
         _rotvec(f"{side}_global_orient", "frame", f"rotation of the {side} hand about its wrist joint"),
         _angles(f"{side}_hand_pose", "frame", 15, f"finger joints of the {side} hand, absolute: zero is flat"),
-        Field(
-            f"{side}_valid",
-            "bool",
-            "False: the hand is not tracked; its numbers are finite but meaningless",
-            shape=("frame",),
-        ),
-        betas,
+        _array(f"{side}_valid", "bool", "frame", untracked),
+        Field(f"{side}_betas", "float32", "MANO shape", shape, axes),
     )
 
 
@@ -92,7 +94,7 @@ def _object_fields(prefix: str, rows: str, target: str) -> tuple[Field, ...]:
     return (
         _rotvec(f"{prefix}_rotvec", rows, f"world_from_object of {target}, column vectors"),
         _point(f"{prefix}_translation_m", rows, f"origin of the object frame of {target}"),
-        Field(f"{prefix}_hinge_rad", "float32", hinge, shape=(rows,), unit="radian", frame="object"),
+        _array(f"{prefix}_hinge_rad", "float32", rows, hinge, "radian", "object"),
     )
 
 
@@ -101,14 +103,14 @@ FRAMES = StoreFile(
     "motion; one file per shard, numbered from 00000",
     "clips of a shard one after another, in the order of sequences.parquet",
     (
-        Field("source_frames", "int32", "index in the source file, from 0, rising", shape=("frame",)),
+        _array("source_frames", "int32", "frame", "index in the source file, from 0, rising"),
         *_hand("left"),
         *_hand("right"),
         *_object_fields("object", "frame", "the manipulated object"),
         *_object_fields("other", "other object x frame", "the further objects, one after another"),
         _rotvec("camera_rotvec", "camera row", "world_from_camera, OpenCV axes (x right, y down, z ahead)"),
         _point("camera_position_m", "camera row", "position of the camera"),
-        Field("camera_images", "int32", "number of the image in the source", shape=("camera row",)),
+        _array("camera_images", "int32", "camera row", "number of the image in the source"),
     ),
 )
 
@@ -121,7 +123,7 @@ BODY = StoreFile(
         _rotvec("global_orient", "body row", "SMPL-X global orientation"),
         _angles("body_pose", "body row", 21, "SMPL-X body joints"),
         _angles("face_pose", "body row", 3, "jaw, left eye, right eye"),
-        Field("expression", "float32", "SMPL-X", shape=("expression row", 10), axes=("expression row", "component")),
+        _array("expression", "float32", "expression row, component:10", "SMPL-X"),
     ),
 )
 
@@ -130,9 +132,9 @@ SOURCE_CONTACT = StoreFile(
     "contact labels of the source, one row per touched vertex and frame; only for shards with a clip that has them",
     "clips of a shard one after another; within a clip by frame, then vertex",
     (
-        Field("frame", "int32", "frame of the clip, from 0", shape=("entry",)),
-        Field("vertex", "int32", "vertex of the clip's object mesh", shape=("entry",)),
-        Field("label", "uint8", "number of the touching body part, in the numbering of the source", shape=("entry",)),
+        _array("frame", "int32", "entry", "frame of the clip, from 0"),
+        _array("vertex", "int32", "entry", "vertex of the clip's object mesh"),
+        _array("label", "uint8", "entry", "number of the touching body part, in the numbering of the source"),
     ),
 )
 
@@ -141,17 +143,9 @@ OBJECT_ARRAYS = StoreFile(
     "canonical meshes; every member is called <object>/<name>",
     "alphabetical",
     (
-        Field(
-            "vertices_m",
-            "float64",
-            "hinge at zero",
-            shape=("vertex", 3),
-            axes=("vertex", "xyz"),
-            unit="metre",
-            frame="object",
-        ),
-        Field("faces", "int32", "vertices of each triangle", shape=("face", 3), axes=("face", "corner")),
-        Field("part", "uint8", "0 base, 1 the part the hinge moves", shape=("vertex",)),
+        _array("vertices_m", "float64", "vertex, xyz:3", "hinge at zero", "metre", "object"),
+        _array("faces", "int32", "face, corner:3", "vertices of each triangle"),
+        _array("part", "uint8", "vertex", "0 base, 1 the part the hinge moves"),
     ),
 )
 
@@ -159,110 +153,63 @@ TEMPLATES = StoreFile(
     "arrays/templates.npz",
     "personal rest meshes; a member's name is the start of the SHA-256 of its bytes",
     "alphabetical",
-    (
-        Field(
-            "<template>",
-            "float32",
-            "replaces MANO's template",
-            shape=(N_VERTICES, 3),
-            axes=("vertex", "xyz"),
-            unit="metre",
-            frame="hand",
-        ),
-    ),
+    (_array("<template>", "float32", f"vertex:{N_VERTICES}, xyz:3", "replaces MANO's template", "metre", "hand"),),
 )
 
 
-def _recorded(name: str, meaning: str, unit: str, frame: str = "world", joints: bool = False) -> Field:
-    shape = ("frame", "joint", 3) if joints else ("frame", 3)
-    axes = ("frame", "joint", "axis-angle") if joints else ("frame", "axis-angle" if unit == "radian" else "xyz")
-    return Field(name, "float32", meaning, shape=shape, axes=axes, unit=unit, frame=frame)
-
-
+_CHAIN = "world_from_wrist of the <side> hand, then joints relative to their parents"
+_TURNS = "frame, joint, axis-angle:3"
 RECORDINGS = StoreFile(
     "arrays/recordings.npz",
     "whole recordings at the frame rate and with the hand joints of the source, if info.json lists any under "
     "recordings; every member is called <sequence>/<name>",
     "alphabetical",
     (
-        *_both(_recorded("<side>_wrist_m", "position of the <side> wrist", "metre")),
-        *_both(
-            _recorded(
-                "<side>_rotvec",
-                "world_from_wrist of the <side> hand, then joints relative to their parents",
-                "radian",
-                "parent joint",
-                joints=True,
-            )
-        ),
-        _recorded("object_rotvec", "world_from_object, column vectors", "radian"),
-        _recorded("object_translation_m", "origin of the object frame", "metre"),
-        Field(
-            "object_hinge_rad",
-            "float32",
-            "as in frames-*.npz; 0 for rigid ones",
-            shape=("frame",),
-            unit="radian",
-            frame="object",
-        ),
-        Field("usable", "bool", "False: tracking failed", shape=("frame",)),
+        *_both(_point("<side>_wrist_m", "frame", "position of the <side> wrist")),
+        *_both(_array("<side>_rotvec", "float32", _TURNS, _CHAIN, "radian", "parent joint")),
+        _rotvec("object_rotvec", "frame", "world_from_object, column vectors"),
+        _point("object_translation_m", "frame", "origin of the object frame"),
+        _array("object_hinge_rad", "float32", "frame", "as in frames-*.npz; 0 for rigid ones", "radian", "object"),
+        _array("usable", "bool", "frame", "False: tracking failed"),
     ),
 )
 
-_JOINT, _CAPSULE = ("joint",), ("capsule",)
-
 
 def _of_hand(name: str, rows: str, meaning: str, frame: str = "joint", unit: str = "metre") -> Field:
-    return Field(name, "float64", meaning, shape=(rows, 3), axes=(rows, "xyz"), unit=unit, frame=frame)
+    return _array(name, "float64", f"{rows}, xyz:3", meaning, unit, frame)
 
 
+_CANONICAL = "columns: to the fingers, to the thumb, out of the back"
 SOURCE_HANDS = StoreFile(
     "arrays/source_hands.npz",
     "the right hands of recordings.npz: skeleton, sensing skin, capsules; every member is called <hand>/<name>, "
     "and info.json names layout and joints under source_hands",
     "alphabetical",
     (
-        Field("parents", "int64", "parent joint; -1 for the wrist, the first joint", shape=_JOINT),
+        _array("parents", "int64", "joint", "parent joint; -1 for the wrist, the first joint"),
         _of_hand("offset_m", "joint", "from the parent", "parent joint"),
-        Field(
-            "rest_rotmats",
-            "float64",
-            "neutral pose, relative to parents",
-            shape=("finger joint", 3, 3),
-            axes=("finger joint", "row", "column"),
-        ),
+        _array("rest_rotmats", "float64", "finger joint, row:3, column:3", "neutral pose, relative to parents"),
         _of_hand("skin_point_m", "skin point", "the five tips, then the proximity sensors, at rest", "skin"),
         _of_hand("skin_normal", "skin point", "outward", "skin", ""),
-        Field("skin_weight", "float64", "of linear blend skinning", shape=("skin point", "joint")),
-        Field(
-            "joint_from_skin", "float64", "rotations at rest", shape=("joint", 3, 3), axes=("joint", "row", "column")
-        ),
+        _array("skin_weight", "float64", "skin point, joint", "of linear blend skinning"),
+        _array("joint_from_skin", "float64", "joint, row:3, column:3", "rotations at rest"),
         _of_hand("joint_from_skin_m", "joint", "the skin frame's origin at rest"),
-        Field("tip_joint", "int64", "last joint of each finger", shape=("finger",)),
-        Field("capsule_joint", "int64", "joint that each capsule moves with", shape=_CAPSULE),
+        _array("tip_joint", "int64", "finger", "last joint of each finger"),
+        _array("capsule_joint", "int64", "capsule", "joint that each capsule moves with"),
         _of_hand("capsule_start_m", "capsule", "centre of the first sphere"),
         _of_hand("capsule_end_m", "capsule", "centre of the last sphere"),
-        Field("capsule_radius_m", "float64", "of the spheres", shape=_CAPSULE, unit="metre"),
-        Field(
-            "wrist_from_canonical",
-            "float64",
-            "columns: to the fingers, to the thumb, out of the back",
-            shape=(3, 3),
-            axes=("row", "column"),
-        ),
+        _array("capsule_radius_m", "float64", "capsule", "of the spheres", "metre"),
+        _array("wrist_from_canonical", "float64", "row:3, column:3", _CANONICAL),
         _of_hand("hinge_axis", "joint", "unit vector; zero for ball joints", unit=""),
-        Field(
-            "limit_rad",
-            "float64",
-            "minimum and maximum angle from the neutral pose",
-            shape=("joint", 2),
-            axes=("joint", "value"),
-            unit="radian",
-        ),
+        _array("limit_rad", "float64", "joint, value:2", "minimum and maximum angle from the neutral pose", "radian"),
     ),
 )
 
 _TEXT, _WHOLE, _ROW = "string", "int32", "int64"
+_TO_SOURCE = "homogeneous matrix, row by row: to the frame and unit of the source"
+_GRAVITY_NOTE = "how gravity was estimated, or why it is unknown; empty if the source states it"
+_FIT_ERROR = "mean error of hands fitted to keypoints; null for parameters"
+_LENS = "fx, fy, cx, cy, width, height"
 
 
 def _rows_of(name: str, array: str, optional: bool = False) -> Field:
@@ -282,7 +229,7 @@ SEQUENCES = StoreFile(
         Field("object_words", _TEXT, "noun of the object, without article"),
         Field("labelled_hand", _TEXT, "the hand an annotator named", required=False, choices=("left", "right", "both")),
         Field("object", _TEXT, "the manipulated object: its row in objects.parquet"),
-        Field("other_objects", _TEXT, "further objects of the scene", shape=("other object",)),
+        _array("other_objects", _TEXT, "other object", "further objects of the scene"),
         Field("n_frames", _WHOLE, "frames at 30 per second"),
         Field("shard", _WHOLE, "number of its frames-, body- and source_contact- file"),
         _rows_of("first_row", "the frame arrays"),
@@ -294,50 +241,18 @@ SEQUENCES = StoreFile(
         ),
         *_both(Field("<side>_valid_frames", _WHOLE, "how many frames of <side>_valid are True")),
         _rows_of("other_row", "the other_ arrays; object k follows k * n_frames later"),
-        Field(
-            "gravity",
-            "float64",
-            "unit vector of gravity; null if unknown",
-            shape=(3,),
-            axes=("xyz",),
-            frame="world",
-            required=False,
-        ),
-        Field(
-            "source_from_world",
-            "float64",
-            "homogeneous matrix, row by row: to the frame and unit of the source",
-            shape=(16,),
-            axes=("row x column",),
-        ),
+        _array("gravity", "float64", "xyz:3", "unit vector of gravity; null if unknown", frame="world", required=False),
+        _array("source_from_world", "float64", "row x column:16", _TO_SOURCE),
         Field("source_fps", "float64", "rate of the source file", unit="1 / second"),
         Field("first_source_frame", _WHOLE, "first of source_frames"),
         Field("last_source_frame", _WHOLE, "last of source_frames"),
-        Field("source_files", _WHOLE, "rows of files.parquet it was read from", shape=("file",)),
+        _array("source_files", _WHOLE, "file", "rows of files.parquet it was read from"),
         Field("synthetic", "bool", "whether the raw data was generated"),
-        Field(
-            "gravity_note",
-            _TEXT,
-            "how gravity was estimated, or why it is unknown; empty if the source states it",
-        ),
+        Field("gravity_note", _TEXT, _GRAVITY_NOTE),
         Field("hands_from", _TEXT, "what the source provides", choices=("parameters", "keypoints")),
-        Field(
-            "fit_error_m",
-            "float64",
-            "mean error of hands fitted to keypoints; null for parameters",
-            unit="metre",
-            required=False,
-        ),
+        Field("fit_error_m", "float64", _FIT_ERROR, unit="metre", required=False),
         Field("camera_name", _TEXT, "as in the source; null without a camera", required=False),
-        Field(
-            "camera_intrinsics",
-            "float64",
-            "fx, fy, cx, cy, width, height",
-            shape=(6,),
-            axes=("value",),
-            unit="pixel",
-            required=False,
-        ),
+        _array("camera_intrinsics", "float64", "value:6", _LENS, "pixel", required=False),
         _rows_of("camera_row", "the camera_ arrays", optional=True),
         _rows_of("body_row", "the arrays of body-*.npz", optional=True),
         _rows_of("expression_row", "expression in body-*.npz", optional=True),
@@ -346,6 +261,7 @@ SEQUENCES = StoreFile(
     ),
 )
 
+_ORIGIN = "a point of the hinge; null when rigid or prismatic"
 OBJECTS = StoreFile(
     "meta/objects.parquet",
     "one row per object",
@@ -355,25 +271,8 @@ OBJECTS = StoreFile(
         Field("n_vertices", _WHOLE, "vertices"),
         Field("n_faces", _WHOLE, "triangles"),
         Field("articulated", "bool", "whether it has a hinge"),
-        Field(
-            "hinge_axis",
-            "float64",
-            "unit vector; null when rigid",
-            shape=(3,),
-            axes=("xyz",),
-            frame="object",
-            required=False,
-        ),
-        Field(
-            "hinge_origin_m",
-            "float64",
-            "a point of the hinge; null when rigid or prismatic",
-            shape=(3,),
-            axes=("xyz",),
-            unit="metre",
-            frame="object",
-            required=False,
-        ),
+        _array("hinge_axis", "float64", "xyz:3", "unit vector; null when rigid", frame="object", required=False),
+        _array("hinge_origin_m", "float64", "xyz:3", _ORIGIN, "metre", "object", required=False),
         Field("digest", _TEXT, "SHA-256 of vertices_m, faces, part, hinge_axis and hinge_origin_m, in that order"),
     ),
 )

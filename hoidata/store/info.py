@@ -35,13 +35,9 @@ def store_info(
     synthetic: bool,
     **further: Any,
 ) -> dict[str, Any]:
-    """Return all facts that ``write_store`` requires, in the layout of ``meta/info.json``.
+    """Return all facts that ``write_store`` requires, in the layout of ``meta/info.json``, and ``further`` keys.
 
-    Args:
-        dataset: name of the dataset.
-        hands: hand model that the parameters belong to.
-        frame, hand_convention, dataset_version, licence, may_be_shared, source_fps, synthetic: as in ``Adapter``.
-        further: keys to add.
+    hands: hand model that the parameters belong to. Facts of the dataset are those of ``Adapter``.
     """
     return {
         "dataset": dataset,
@@ -58,12 +54,9 @@ def store_info(
 
 
 def embedded_hand_warning(info: Mapping[str, Any]) -> str:
-    """Return a warning if MANO parameters were converted with the embedded hand; else "".
+    """Return a warning if MANO parameters were converted with the embedded hand; else "". info: of ``store_info``.
 
     Generated raw files and fitted hands are exact with the embedded hand, so they give no warning.
-
-    Args:
-        info: ``meta/info.json`` of a store, or the result of ``store_info``.
     """
     is_exact = info["synthetic"] or info["hand_convention"]["shape"] == "fitted"
     if is_exact or info["hand_model"]["name"] != load_embedded_hands().right.name:

@@ -22,10 +22,8 @@ _NPY_HEADER = 1 << 16  # maximum size in bytes of a member's dtype and shape
 def map_npz(path: str | Path) -> dict[str, np.ndarray]:
     """Map an uncompressed NPZ file: read-only views of one memory map. Nothing is unpickled.
 
-    The first call of a process reads the whole file to verify the checksums, at a few gigabytes per second.
-
-    Raises:
-        BadInput: the file is missing, truncated, compressed or contains Python objects, or a checksum differs.
+    The first call of a process reads the whole file to verify the checksums, at a few gigabytes per second. Raises
+    BadInput if the file is missing, truncated, compressed or contains Python objects, or a checksum differs.
     """
     if not Path(path).is_file():
         raise BadInput(path, "an array file of the store", "nothing there", REMEDY)

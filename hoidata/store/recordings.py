@@ -14,6 +14,9 @@ from hoidata.objects.model import ObjectModel
 from hoidata.store.fields import RECORDINGS, SOURCE_HANDS
 
 _DIGITS = 16
+# Members with the name of their attribute.
+_OF_HAND = ("parents", "offset_m", "rest_rotmats", "tip_joint", "wrist_from_canonical", "hinge_axis", "limit_rad")
+_OF_CAPSULES = ("joint", "start_m", "end_m", "radius_m")
 
 
 class RecordingWriter:
@@ -90,22 +93,13 @@ def _hand_arrays(hand: TrackedHand) -> dict[str, np.ndarray]:
     if skin.corrective_m is not None:
         raise ValueError("a hand with pose blend shapes is stored by its model's digest, not by its arrays")
     return {
-        "parents": hand.parents,
-        "offset_m": hand.offset_m,
-        "rest_rotmats": hand.rest_rotmats,
+        **{name: getattr(hand, name) for name in _OF_HAND},
+        **{f"capsule_{name}": getattr(capsules, name) for name in _OF_CAPSULES},
         "skin_point_m": skin.point_m,
         "skin_normal": skin.normal,
         "skin_weight": skin.weight,
         "joint_from_skin": skin.joint_from_skin.rotation,
         "joint_from_skin_m": skin.joint_from_skin.translation,
-        "tip_joint": hand.tip_joint,
-        "capsule_joint": capsules.joint,
-        "capsule_start_m": capsules.start_m,
-        "capsule_end_m": capsules.end_m,
-        "capsule_radius_m": capsules.radius_m,
-        "wrist_from_canonical": hand.wrist_from_canonical,
-        "hinge_axis": hand.hinge_axis,
-        "limit_rad": hand.limit_rad,
     }
 
 
@@ -117,14 +111,8 @@ def read_hand(key: str, facts: Mapping[str, Any], arrays: Mapping[str, np.ndarra
         side="right",
         layout=facts["layout"],
         joint_names=tuple(facts["joints"]),
-        parents=members["parents"],
-        offset_m=members["offset_m"],
-        rest_rotmats=members["rest_rotmats"],
         skin=Skin(members["skin_point_m"], members["skin_normal"], members["skin_weight"], to_joint),
-        tip_joint=members["tip_joint"],
-        capsules=JointCapsules(*(members[f"capsule_{name}"] for name in ("joint", "start_m", "end_m", "radius_m"))),
+        capsules=JointCapsules(*(members[f"capsule_{name}"] for name in _OF_CAPSULES)),
         middle_knuckle=facts["middle_knuckle"],
-        wrist_from_canonical=members["wrist_from_canonical"],
-        hinge_axis=members["hinge_axis"],
-        limit_rad=members["limit_rad"],
+        **{name: members[name] for name in _OF_HAND},
     )

@@ -104,13 +104,8 @@ def stored_hinge(axis: Any, origin_m: Any) -> Hinge:
 def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
     """Open a store for reading.
 
-    Args:
-        folder: the store.
-        hands: hand model of its parameters. Only ``joints`` needs it, and only if it is not the embedded hand.
-
-    Raises:
-        MissingResource: ``folder`` is not a store.
-        BadInput: the store has another schema version or another hand model.
+    hands: hand model of its parameters. Only ``joints`` needs it, and only if it is not the embedded hand.
+    Raises MissingResource if ``folder`` is not a store, BadInput for another schema version or hand model.
     """
     folder = Path(folder)
     info = read_info(folder)
@@ -134,9 +129,8 @@ def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
 def read_info(folder: str | Path) -> dict[str, Any]:
     """Read ``meta/info.json``.
 
-    Raises:
-        MissingResource: ``folder`` is not a store, or is empty for a stated reason.
-        BadInput: the file is invalid or of another schema version.
+    Raises MissingResource if ``folder`` is not a store, or is empty for a stated reason; BadInput if the file is
+    invalid or of another schema version.
     """
     path = Path(folder) / "meta" / "info.json"
     for parent in (Path(folder), Path(folder).parent):  # a family without motions has empty.json instead of clips/
@@ -182,9 +176,7 @@ class Store:
     def clip(self, clip_id: str, *, motion_only: bool = False) -> Clip:
         """Read a clip, float32. Raises KeyError for an unknown id.
 
-        Args:
-            clip_id: the clip.
-            motion_only: skip camera, body and contact labels of the source, which can be larger than all the rest.
+        motion_only: skip camera, body and contact labels of the source, which can be larger than all the rest.
         """
         facts = self._facts(clip_id)
         frames, shard, gravity = facts["frames"], self._frames(facts["shard"]), facts["gravity"]
@@ -293,9 +285,7 @@ class Store:
             return None
         rotvec, position_m, images = (array[first : first + facts["n_frames"]].copy() for array in shard.camera)
         intrinsics = None if intrinsics is None else np.array(intrinsics)
-        return CameraTrack(
-            name=facts["camera_name"], rotvec=rotvec, position_m=position_m, images=images, intrinsics=intrinsics
-        )
+        return CameraTrack(facts["camera_name"], rotvec, position_m, images, intrinsics=intrinsics)
 
     def _body(self, facts: dict[str, Any]) -> BodyTrack | None:
         if facts["body_row"] < 0:

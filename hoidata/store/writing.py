@@ -166,20 +166,10 @@ def mesh_digest(arrays: dict[str, np.ndarray], model: ObjectModel) -> str:
 def write_store(
     folder: str | Path, clips: Iterable[Clip | HandRecording | Quarantined], info: dict[str, Any]
 ) -> dict[str, int]:
-    """Write clips, in the order given, as the store ``folder``; it appears whole or not at all.
+    """Write clips, in the order given, as the store ``folder``; it appears whole or not at all. Returns the counts.
 
-    A clip with the id of an earlier clip is quarantined.
-
-    Args:
-        folder: the store to write.
-        clips: clips, whole recordings and quarantined items.
-        info: the facts of ``hoidata.store.info.store_info``, and further keys for ``meta/info.json``.
-
-    Returns:
-        The counts: clips, frames, objects, files, quarantined.
-
-    Raises:
-        BadInput: a clip breaks the schema, or ``info`` lacks a required fact.
+    A clip with the id of an earlier clip is quarantined. info: the facts of ``hoidata.store.info.store_info``, and
+    further keys for ``meta/info.json``. Raises BadInput if a clip breaks the schema, or ``info`` lacks a required fact.
     """
     check_info(info)
     with atomic_folder(folder) as partial:

@@ -41,6 +41,10 @@ def box_at(size, offset, radius_m=0.004, spacing_m=0.012) -> Callable[[], Solid]
     return lambda: rounded_box(size, radius_m, spacing_m).moved(offset)
 
 
+def _cylinder_at(radius_m: float, height_m: float, offset) -> Callable[[], Solid]:
+    return lambda: cylinder(radius_m, height_m).moved(offset)
+
+
 def _bottle(body_m: float, shoulder_m: float, neck_m: float, cap_m: float, height_m: float) -> Callable[[], Solid]:
     """Radii of body, neck and cap; the neck starts at ``shoulder_m`` above the ground, the cap 3 cm below the top."""
     cap = height_m - 0.03
@@ -144,8 +148,8 @@ H2O_OBJECTS = (
     ObjectSpec("lotion", "lotion", _bottle(0.03, 0.125, 0.013, 0.017, 0.18)),
     ObjectSpec("spray", "spray", _spray),
     ObjectSpec("milk", "milk", _milk),
-    ObjectSpec("cocoa", "cocoa", lambda: cylinder(0.037, 0.13).moved((0, 0, 0.065))),
-    ObjectSpec("chips", "chips", lambda: cylinder(0.035, 0.2).moved((0, 0, 0.1))),
+    ObjectSpec("cocoa", "cocoa", _cylinder_at(0.037, 0.13, (0, 0, 0.065))),
+    ObjectSpec("chips", "chips", _cylinder_at(0.035, 0.2, (0, 0, 0.1))),
     ObjectSpec("cappuccino", "cappuccino", _cone_cup),
 )
 
@@ -154,8 +158,8 @@ GRAB_OBJECTS = (
     ObjectSpec("cubemedium", "medium cube", lambda: sharp_box((0.06, 0.06, 0.06)).moved((0, 0, 0.03)), stand_m=0.04),
     ObjectSpec("spherelarge", "large sphere", lambda: sphere(0.06, 48).moved((0, 0, 0.06))),
     ObjectSpec("spheremedium", "medium sphere", lambda: sphere(0.04).moved((0, 0, 0.04))),
-    ObjectSpec("cylinderlarge", "large cylinder", lambda: cylinder(0.042, 0.14).moved((0, 0, 0.07))),
-    ObjectSpec("cylindermedium", "medium cylinder", lambda: cylinder(0.03, 0.1).moved((0, 0, 0.05))),
+    ObjectSpec("cylinderlarge", "large cylinder", _cylinder_at(0.042, 0.14, (0, 0, 0.07))),
+    ObjectSpec("cylindermedium", "medium cylinder", _cylinder_at(0.03, 0.1, (0, 0, 0.05))),
     ObjectSpec("toruslarge", "large torus", lambda: torus(0.06, 0.02).moved((0, 0, 0.02)), stand_m=0.06),
     ObjectSpec("apple", "apple", lambda: sphere(0.038).moved((0, 0, 0.038))),
     ObjectSpec("mug", "mug", _mug),
@@ -173,14 +177,16 @@ def hinged(
     name: str, words: str, width: float, depth: float, base: float, lid: float, stand_m: float = 0.0
 ) -> ObjectSpec:
     """Two slabs with the hinge at the back: width along the hinge, depth towards the person, heights of both."""
-    return ObjectSpec(
-        name=name,
-        words=words,
-        base=box_at((width, depth, base), (0, -depth / 2, -base / 2 - 0.0005), 0.003, 0.014),
-        lid=box_at((width, depth, lid), (0, -depth / 2, lid / 2 + 0.0005), 0.003, 0.014),
-        stand_m=stand_m,
-        standing_deg=HINGE_BEHIND,
-    )
+    base_solid = box_at((width, depth, base), (0, -depth / 2, -base / 2 - 0.0005), 0.003, 0.014)
+    lid_solid = box_at((width, depth, lid), (0, -depth / 2, lid / 2 + 0.0005), 0.003, 0.014)
+    return hinged_behind(name, words, base_solid, lid_solid, stand_m)
+
+
+def hinged_behind(
+    name: str, words: str, base: Callable[[], Solid], lid: Callable[[], Solid], stand_m: float = 0.0
+) -> ObjectSpec:
+    """An object with the hinge at the back."""
+    return ObjectSpec(name, words, base, lid, stand_m=stand_m, standing_deg=HINGE_BEHIND)
 
 
 ARCTIC_OBJECTS = (
@@ -194,37 +200,20 @@ ARCTIC_OBJECTS = (
         box_at((0.2, 0.13, 0.13), (0.1, 0.0655, 0.065), 0.003, 0.013),
         box_at((0.2, 0.018, 0.13), (0.1, -0.0095, 0.065), 0.003, 0.013),
     ),
-    ObjectSpec(
-        name="ketchup",
-        words="ketchup",
-        base=_ketchup_bottle,
-        lid=lambda: cylinder(0.022, 0.03).moved((0, -0.024, 0.0155)),
-        stand_m=0.0,
-        standing_deg=HINGE_BEHIND,
-    ),
-    ObjectSpec(
-        name="waffleiron",
-        words="waffle iron",
-        base=lambda: cylinder(0.085, 0.04).moved((0, -0.085, -0.0205)),
-        lid=lambda: cylinder(0.085, 0.03).moved((0, -0.085, 0.0155)),
+    hinged_behind("ketchup", "ketchup", _ketchup_bottle, _cylinder_at(0.022, 0.03, (0, -0.024, 0.0155))),
+    hinged_behind(
+        "waffleiron",
+        "waffle iron",
+        _cylinder_at(0.085, 0.04, (0, -0.085, -0.0205)),
+        _cylinder_at(0.085, 0.03, (0, -0.085, 0.0155)),
         stand_m=0.06,
-        standing_deg=HINGE_BEHIND,
     ),
-    ObjectSpec(
-        name="mixer",
-        words="mixer",
-        base=_mixer_base,
-        lid=box_at((0.06, 0.19, 0.06), (0, -0.095, 0.0305)),
-        stand_m=0.0,
-        standing_deg=HINGE_BEHIND,
-    ),
-    ObjectSpec(
-        name="capsulemachine",
-        words="capsule machine",
-        base=box_at((0.1, 0.16, 0.16), (0, -0.08, -0.0805), 0.004, 0.015),
-        lid=box_at((0.09, 0.15, 0.02), (0, -0.075, 0.0105)),
-        stand_m=0.0,
-        standing_deg=HINGE_BEHIND,
+    hinged_behind("mixer", "mixer", _mixer_base, box_at((0.06, 0.19, 0.06), (0, -0.095, 0.0305))),
+    hinged_behind(
+        "capsulemachine",
+        "capsule machine",
+        box_at((0.1, 0.16, 0.16), (0, -0.08, -0.0805), 0.004, 0.015),
+        box_at((0.09, 0.15, 0.02), (0, -0.075, 0.0105)),
     ),
 )
 
@@ -232,7 +221,6 @@ OBJECTS = {"h2o": H2O_OBJECTS, "grab": GRAB_OBJECTS, "arctic": ARCTIC_OBJECTS}
 
 
 def object_spec(dataset: str, name: str) -> ObjectSpec:
-    """Return the spec of an object. Raises KeyError for an unknown name."""
     return {spec.name: spec for spec in OBJECTS[dataset]}[name]
 
 
@@ -255,10 +243,4 @@ def model_of(spec: ObjectSpec) -> ObjectModel:
         hinge = Hinge(ARCTIC_AXIS, np.zeros(3))
     # Rounded so that the files reproduce the ground truth exactly.
     stored = np.concatenate(vertices) @ spec.upright_from_object
-    return ObjectModel(
-        name=spec.name,
-        vertices_m=np.round(stored, 7),
-        faces=np.concatenate(faces),
-        part=np.concatenate(part),
-        hinge=hinge,
-    )
+    return ObjectModel(spec.name, np.round(stored, 7), np.concatenate(faces), np.concatenate(part), hinge=hinge)

@@ -91,9 +91,9 @@ def _dataset_metrics(dataset: str, sequences: list[SequenceMetrics]) -> dict[str
     }
 
 
-def check_corpus(size: AnySize = "full", seed: int = 0, jobs: int = 2, datasets: tuple[str, ...] = ()) -> pd.DataFrame:
-    """Generate the corpora again and measure them. datasets: by default all that have this size."""
-    sequences = [truth for dataset in datasets or datasets_of(size) for truth in make_corpus(dataset, seed, size, jobs)]
+def check_corpus(size: AnySize = "full", seed: int = 0, jobs: int = 2) -> pd.DataFrame:
+    """Generate the corpora again and measure them."""
+    sequences = [truth for dataset in datasets_of(size) for truth in make_corpus(dataset, seed, size, jobs)]
     return check_sequences(sequences, jobs)
 
 

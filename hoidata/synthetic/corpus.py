@@ -13,8 +13,7 @@ from hoidata.synthetic.actions import DATASET_IDS, Size
 from hoidata.synthetic.catalogue import OBJECTS, ObjectSpec
 from hoidata.synthetic.generate import make_action, place_in_raw_sequences, tasks_of
 from hoidata.synthetic.study import clip_tasks, find_grasps, make_clips, pool_tasks
-from hoidata.synthetic.study_objects import STUDY_OBJECTS
-from hoidata.synthetic.study_plan import StudySize
+from hoidata.synthetic.study_plan import STUDY_OBJECTS, StudySize
 from hoidata.synthetic.truth import TruthSequence
 from hoidata.synthetic.write_arctic import write_arctic_meta, write_arctic_sequence
 from hoidata.synthetic.write_grab import write_grab_meshes, write_grab_sequence
@@ -36,20 +35,10 @@ _WRITERS = {
 def write_corpus(
     dataset: str, root: str | Path, seed: int = 0, size: AnySize = "full", jobs: int = 2
 ) -> list[TruthSequence]:
-    """Generate and write a corpus; it replaces the folder ``root``.
+    """Generate and write a corpus; it replaces the folder ``root``. Returns its ground truth.
 
-    Args:
-        dataset: "h2o", "grab" or "arctic"; the study sizes have only "grab" and "arctic".
-        root: folder to write.
-        seed: seed of all random numbers.
-        size: which corpus.
-        jobs: number of worker processes; the result does not depend on it.
-
-    Returns:
-        The ground truth of the corpus.
-
-    Raises:
-        HoidataError: the dataset is unknown, or no plausible sequence was found for an action.
+    dataset: "h2o", "grab" or "arctic"; the study sizes have only "grab" and "arctic". jobs: worker processes, on which
+    the result does not depend. Raises HoidataError if the dataset is unknown, or if no plausible sequence was found.
     """
     if dataset not in datasets_of(size):
         raise HoidataError(f"no corpus {size} named {dataset!r}; there are {', '.join(datasets_of(size))}")

@@ -9,8 +9,7 @@ from hoidata.errors import HoidataError
 from hoidata.hands import HandPair, load_embedded_hands
 from hoidata.synthetic.actions import ACTIONS, DATASET_IDS, Entry, Size, plan, subjects
 from hoidata.synthetic.catalogue import object_model, object_spec
-from hoidata.synthetic.grasps import Grip, Scene
-from hoidata.synthetic.pools import GRASPS_PER_PAIR, search_pool
+from hoidata.synthetic.grasps import GRASPS_PER_PAIR, Grip, Scene, search_pool
 from hoidata.synthetic.sequences import Person, make_person, make_sequence, sample_length
 from hoidata.synthetic.soundness import measure
 from hoidata.synthetic.truth import TruthSequence
@@ -97,14 +96,9 @@ GAP_FRAMES = 6
 
 
 def place_in_raw_sequences(dataset: str, generated: list[tuple[int, TruthSequence]]) -> list[TruthSequence]:
-    """Assign a raw sequence and a first frame to each action. Raw sequences of H2O and ARCTIC have several actions.
+    """Assign a raw sequence and a first frame to each action; returns the actions in the order of the plan.
 
-    Args:
-        dataset: name of the dataset.
-        generated: actions with their positions in the plan, in any order.
-
-    Returns:
-        The actions in the order of the plan.
+    Raw sequences of H2O and ARCTIC have several actions. generated: actions with their positions in the plan.
     """
     sequences = [truth for _, truth in sorted(generated, key=lambda pair: pair[0])]
     if dataset == "grab":

@@ -1,7 +1,8 @@
 """Grasp search: random placement, closing of the fingers, and a test of force closure.
 
 Frame of the search: the object upright on the table, with the origin of its mesh. Placements are sampled in a cone of
-directions. Fingers close as capsules (closing.py). The final test uses the meshes of hand and object.
+directions. Fingers close as capsules (hand_capsules.py). The final test uses the meshes of hand and object. The grasps
+of a pair of verb and object are searched with an average hand, then closed for each subject.
 """
 
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ import torch
 from scipy.optimize import nnls
 
 from hoidata.clips.clip import HandType, Side
+from hoidata.errors import HoidataError
 from hoidata.geometry.rotations import mirror_rotvec_x, rotvec_to_rotmat
 from hoidata.hands import HandPair
 from hoidata.hands.tracks import kinematics_of
@@ -20,8 +22,20 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.contact_forces import body_motion, hand_patches, patch_contacts, wrench_columns
 from hoidata.synthetic.catalogue import ObjectSpec
-from hoidata.synthetic.closing import Field, Placement, close_fingers, gradient, grid_field, mirrored, sample_placements
-from hoidata.synthetic.hand_capsules import OPEN_RAD, CapsuleHands, capsule_points, hand_pose_rotvec
+from hoidata.synthetic.hand_capsules import (
+    OPEN_RAD,
+    CapsuleHands,
+    Field,
+    Placement,
+    capsule_hands,
+    capsule_points,
+    close_fingers,
+    gradient,
+    grid_field,
+    hand_pose_rotvec,
+    mirrored,
+    sample_placements,
+)
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
 LARGEST_PENETRATION_M = 0.007
@@ -132,13 +146,7 @@ class Candidates(NamedTuple):
 
     def take(self, rows: np.ndarray) -> "Candidates":
         placement, hands = self.placement.take(rows), self.hands.take(rows)
-        return Candidates(
-            side=self.side,
-            placement=placement,
-            hands=hands,
-            wrist_m=self.wrist_m[rows],
-            flexion_rad=self.flexion_rad[rows],
-        )
+        return Candidates(self.side, placement, hands, self.wrist_m[rows], flexion_rad=self.flexion_rad[rows])
 
     def points(self, flexion_rad: np.ndarray) -> np.ndarray:
         """Return (candidate, 21, 4, 3) capsule points, with fingers flexed by ``flexion_rad (candidate, 5, 3)``."""
@@ -270,21 +278,14 @@ def posed_hands(candidates: Candidates, betas: np.ndarray) -> PosedHands:
     rotmats, spread, rows = candidates.placement.rotmats, candidates.placement.spread_rad, candidates.placement.hand
     pose = hand_pose_rotvec(candidates.hands, candidates.flexion_rad, spread)
     opened = hand_pose_rotvec(candidates.hands, candidates.open_rad, spread)
-    if candidates.side == "right":
-        return PosedHands(
-            side="right",
-            wrist_m=candidates.wrist_m,
-            rotmats=rotmats,
-            hand_pose=pose,
-            open_pose=opened,
-            betas=betas[rows],
-        )
-    mirror = np.diag(MIRROR)
-    pose, opened = (mirror_rotvec_x(one.reshape(-1, 15, 3)).reshape(-1, 45) for one in (pose, opened))
+    wrist_m = candidates.wrist_m
+    if candidates.side == "left":
+        wrist_m, rotmats = wrist_m * MIRROR, np.diag(MIRROR) @ rotmats @ np.diag(MIRROR)
+        pose, opened = (mirror_rotvec_x(one.reshape(-1, 15, 3)).reshape(-1, 45) for one in (pose, opened))
     return PosedHands(
-        side="left",
-        wrist_m=candidates.wrist_m * MIRROR,
-        rotmats=mirror @ rotmats @ mirror,
+        side=candidates.side,
+        wrist_m=wrist_m,
+        rotmats=rotmats,
         hand_pose=pose,
         open_pose=opened,
         betas=betas[rows],
@@ -366,3 +367,114 @@ def to_grip(scene: Scene, approach: Approach, hands: PosedHands, index: int) -> 
         open_pose=hands.open_pose[index],
         part=int(approach.part == 1),
     )
+
+
+GRASPS_PER_PAIR = 2
+_MAX_GRASPS = 8  # per subject
+_RESERVES = 2
+_CANDIDATES_PER_ROUND = 96
+_MAX_ROUNDS = 40
+_STRICT_ROUNDS = 4  # after these rounds, grasps need not work for all subjects
+_VERIFIED_PER_ROUND = 6
+
+
+def search_pool(
+    scene: Scene,
+    grasp: GraspSpec,
+    pair: HandPair,
+    betas: np.ndarray,
+    rng: np.random.Generator,
+    enough: int = GRASPS_PER_PAIR,
+    rounds: int = _MAX_ROUNDS,
+    complete: bool = True,
+) -> list[list[tuple[Grip, ...]]]:
+    """Search grasps for several subjects: by subject, the grasps, each with one grip per hand.
+
+    betas: (subject, 10) hand shapes. The search ends with ``enough`` grasps that all subjects can use, or after
+    ``rounds``. complete: raise HoidataError if a subject has no grasp.
+    """
+    average = capsule_hands(pair.right, np.zeros((1, 10)))
+    subject_hands = capsule_hands(pair.right, betas)
+    grasps_of: list[list[tuple[Grip, ...]]] = [[] for _ in betas]
+    ranked: list[tuple[np.ndarray, list[tuple[Grip, ...] | None]]] = []
+    for round_number in range(rounds):
+        placements = _promising(scene, grasp, average, rng)
+        if placements is None:
+            continue
+        ranked += _for_subjects(scene, grasp, placements, subject_hands, betas, pair)
+        if _enough(np.array([scores > 0 for scores, _ in ranked]), round_number, enough):
+            break
+    ranked.sort(key=lambda entry: (-(entry[0] > 0).sum(), -entry[0].mean()))
+    for _, grips in ranked:
+        for subject, grip in enumerate(grips):
+            if grip is not None and len(grasps_of[subject]) < _MAX_GRASPS:
+                grasps_of[subject].append(grip)
+    missing = [index for index, grips in enumerate(grasps_of) if not grips]
+    if missing and complete:
+        raise HoidataError(f"{scene.spec.name}: no {grasp.hand} grasp found for subjects {missing} of {len(grasps_of)}")
+    return grasps_of
+
+
+def _enough(works: np.ndarray, round_number: int, enough: int) -> bool:
+    """Whether to stop: enough grasps for all subjects, later enough for each. works: (placement, subject) bool."""
+    shared = int(works.all(axis=1).sum())
+    return shared >= enough or (
+        round_number >= _STRICT_ROUNDS and int(works.sum(axis=0).min()) >= max(enough, _RESERVES)
+    )
+
+
+def _promising(scene: Scene, grasp: GraspSpec, hands: CapsuleHands, rng: np.random.Generator) -> list[Placement] | None:
+    """Sample placements, one per hand, whose capsule hands have force closure."""
+    sides = []
+    for side, reach in grasp.approaches:
+        placement = sample_candidates(scene, side, reach, 3 * _CANDIDATES_PER_ROUND, rng)
+        placement = placement.take(np.arange(min(_CANDIDATES_PER_ROUND, len(placement.hand))))
+        closed = close_candidates(scene, side, placement, hands)
+        sides.append(closed.take(np.flatnonzero(clear_of_table(scene, closed))))
+    count = min(len(side.placement.hand) for side in sides)
+    if count == 0:
+        return None
+    sides = [side.take(np.arange(count)) for side in sides]
+    good = np.flatnonzero(_has_force_closure(scene, sides))[:_VERIFIED_PER_ROUND]
+    return [side.placement.take(good) for side in sides] if len(good) else None
+
+
+def _has_force_closure(scene: Scene, sides: list[Candidates]) -> np.ndarray:
+    hinge = np.full(1, scene.hinge_rad) if scene.model.is_articulated else None
+    centre = scene.upright @ body_motion(scene.model, np.eye(3)[None], np.zeros((1, 3)), hinge).centre_m[0]
+    contacts = [capsule_contacts(scene, side) for side in sides]
+    apart = hand_gap_m(sides) > SMALLEST_HAND_GAP_M
+    is_closed = np.zeros(len(apart), dtype=bool)
+    for index in np.flatnonzero(apart):
+        points = np.concatenate([side[index][0] for side in contacts])
+        normals = np.concatenate([side[index][1] for side in contacts])
+        is_closed[index] = closes_force(points, normals, centre)
+    return is_closed
+
+
+def _for_subjects(
+    scene: Scene, grasp: GraspSpec, placements, subject_hands: CapsuleHands, betas: np.ndarray, pair: HandPair
+):
+    """Return (subject,) scores and grips of each placement, closed with the hand of each subject."""
+    n_subjects = len(betas)
+    sides = [
+        close_candidates(scene, side, placement.for_hands(n_subjects), subject_hands)
+        for (side, _), placement in zip(grasp.approaches, placements, strict=True)
+    ]
+    posed = [posed_hands(side, betas) for side in sides]
+    score = verify(scene, grasp, posed, pair)
+    clear = np.all([clear_of_table(scene, side) for side in sides], axis=0) & (hand_gap_m(sides) > SMALLEST_HAND_GAP_M)
+    score = np.where(clear, score, 0.0).reshape(-1, n_subjects)
+    entries = []
+    for index, scores in enumerate(score):
+        grips = [
+            tuple(
+                to_grip(scene, reach, hand, index * n_subjects + subject)
+                for (_, reach), hand in zip(grasp.approaches, posed, strict=True)
+            )
+            if scores[subject] > 0
+            else None
+            for subject in range(n_subjects)
+        ]
+        entries.append((scores, grips))
+    return entries

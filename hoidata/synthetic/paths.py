@@ -170,13 +170,8 @@ def follow_path(
 ) -> ObjectPath:
     """Evaluate the path of an action, with lifting before and lowering after it.
 
-    Args:
-        motion: keyframes.
-        frames: (frame,) times in frames at 30 fps, possibly fractions.
-        start, length: start and duration of the action, in the same unit.
-        mirrored: whether a left hand acts.
-        size: scale of the shifts.
-        rotation_scale: scale of the rotations.
+    frames: (frame,) times in frames at 30 fps, possibly fractions; start and length of the action in the same unit.
+    mirrored: a left hand acts. size, rotation_scale: scales of shifts and rotations.
     """
     times = [start + key.phase * length for key in motion.keys]
     keys = np.array([(*key.shift_m, *np.deg2rad(key.rotation_deg), key.hinge) for key in motion.keys], dtype=np.float64)

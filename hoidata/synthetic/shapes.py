@@ -71,12 +71,9 @@ def _compact(vertices: np.ndarray, faces: np.ndarray) -> Solid:
 
 
 def revolved(profile: ArrayLike, sections: int = 40, spacing_m: float = 0.012) -> Solid:
-    """Solid of revolution about the z axis.
+    """Solid of revolution about the z axis. Segments of the profile longer than ``spacing_m`` are subdivided.
 
-    Args:
-        profile: (point, 2) radius and height, from bottom to top; the first and last points are on the axis.
-        sections: number of sections around the axis.
-        spacing_m: longer segments of the profile are subdivided.
+    profile: (point, 2) radius and height, from bottom to top; the first and last points are on the axis.
     """
     points = _subdivided(np.asarray(profile, dtype=np.float64), spacing_m)
     if abs(points[0, 0]) > 1e-12 or abs(points[-1, 0]) > 1e-12:

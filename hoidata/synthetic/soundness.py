@@ -41,8 +41,8 @@ class Soundness:
     penetration_m: np.ndarray  # (frame,) depth, in all frames
     joint_m: np.ndarray  # (grasp frame,) distance of the closest joint of the farther hand
     idle_m: float  # smallest distance of an idle hand's joints to the object's vertices
-    least_idle_m: float = _IDLE_M  # minimum of ``idle_m``
-    clear: bool = True  # whether hands keep clear of the table and of each other
+    least_idle_m: float  # minimum of ``idle_m``
+    clear: bool  # whether hands keep clear of the table and of each other
 
     @property
     def is_sound(self) -> bool:
@@ -58,13 +58,7 @@ class Soundness:
 
 
 def measure(truth: TruthSequence, pair: HandPair, hand_shift_m: np.ndarray | None = None) -> Soundness:
-    """Measure an action at 30 fps.
-
-    Args:
-        truth: the action.
-        pair: hand models.
-        hand_shift_m: (3,) world translation of the active hands, for the negative control.
-    """
+    """Measure an action at 30 fps. hand_shift_m: (3,) translation of the active hands, for the negative control."""
     truth = truth.at_30_fps()
     lifted = np.flatnonzero(truth.lifted)
     near: dict[Side, SignedDistance] = {
@@ -75,28 +69,22 @@ def measure(truth: TruthSequence, pair: HandPair, hand_shift_m: np.ndarray | Non
     joints: dict[Side, np.ndarray] = {
         side: _joint_distance(truth, side, pair, one, hand_shift_m) for side, one in near.items()
     }
-    residual = _residuals(truth, near, pair, lifted)
     if truth.contact_by_side:
         distance, joint = _during_contact(truth, distances), _during_contact(truth, joints)
-        idle, clear = _near_idle(truth, pair), _is_clear(truth, pair)
-        return Soundness(
-            residual=residual,
-            distance_m=np.maximum(distance, 0),
-            penetration_m=penetration,
-            joint_m=joint,
-            idle_m=idle,
-            least_idle_m=_NEAR_IDLE_M,
-            clear=clear,
+        idle_m, least_idle_m, clear = _near_idle(truth, pair), _NEAR_IDLE_M, _is_clear(truth, pair)
+    else:
+        distance, joint = (
+            np.max([values[lifted] for values in by_side.values()], axis=0) for by_side in (distances, joints)
         )
-    distance, joint = (
-        np.max([values[lifted] for values in by_side.values()], axis=0) for by_side in (distances, joints)
-    )
+        idle_m, least_idle_m, clear = _idle(truth, pair), _IDLE_M, True
     return Soundness(
-        residual=residual,
+        residual=_residuals(truth, near, pair, lifted),
         distance_m=np.maximum(distance, 0),
         penetration_m=penetration,
         joint_m=joint,
-        idle_m=_idle(truth, pair),
+        idle_m=idle_m,
+        least_idle_m=least_idle_m,
+        clear=clear,
     )
 
 

@@ -12,28 +12,41 @@ from hoidata.geometry.rotations import mirror_rotvec_x, rotmat_to_rotvec, rotvec
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
 from hoidata.synthetic.actions import DATASET_IDS
 from hoidata.synthetic.catalogue import model_of
-from hoidata.synthetic.grasps import Grip, PosedHands, Scene
-from hoidata.synthetic.hand_play import grasp_play, recorded_hand, recorded_object
+from hoidata.synthetic.grasps import Grip, PosedHands, Scene, search_pool
 from hoidata.synthetic.paths import ObjectPath, follow_path, minimum_jerk, with_sway
-from hoidata.synthetic.pools import search_pool
 from hoidata.synthetic.sequences import (
     LIFTED_ABOVE_M,
     SOURCE_FPS,
     Pace,
     Person,
     Span,
+    grasp_play,
     grasping_hand,
     grasps_of,
     hand_track,
     idle_hand,
     make_person,
     object_pose,
+    recorded_hand,
+    recorded_object,
     released_frames,
     sample_release,
 )
 from hoidata.synthetic.soundness import measure, vertex_distances_m
-from hoidata.synthetic.study_objects import ANGLES, STUDY_OBJECTS, Region, StudyObject
-from hoidata.synthetic.study_plan import HANDOVER, SCREWING, VERBS, StudyEntry, StudySize, choices, shares, study_plan
+from hoidata.synthetic.study_plan import (
+    ANGLES,
+    HANDOVER,
+    SCREWING,
+    STUDY_OBJECTS,
+    VERBS,
+    Region,
+    StudyEntry,
+    StudyObject,
+    StudySize,
+    choices,
+    shares,
+    study_plan,
+)
 from hoidata.synthetic.truth import TruthSequence
 
 _MAX_GRASPS = 8  # for one clip
@@ -161,14 +174,7 @@ def _sound_clip(task: ClipTask, entry: StudyEntry, pair: HandPair) -> TruthSeque
         for attempt in range(len(_PLAYS) * len(grasps)):
             grips = grasps[(first + attempt) % len(grasps)]
             scenario = Scenario(
-                dataset=dataset,
-                study_object=study_object,
-                verb=entry.verb,
-                region=regions[0],
-                grips=grips,
-                person=person,
-                source_key=key,
-                left=left,
+                dataset, study_object, entry.verb, regions[0], grips=grips, person=person, source_key=key, left=left
             )
             truth = make_study_sequence(scenario, contact_frames, pair, _PLAYS[attempt // len(grasps)], rng)
             if measure(truth, pair).is_sound:

@@ -1,20 +1,250 @@
-"""Plan of the corpus ``study``: verbs crossed with objects, hands and regions, over disjoint subjects.
+"""Objects, grasp regions (handle, rim, body, top) and plan of the corpus ``study``.
 
-In contrast to the embedded corpora, object and hand do not determine the verb. Verb, object and hand do not determine
-the grasped region.
+A region is defined for the right hand, or for both hands. Left hands use its mirror image, so each object has a plane
+of symmetry. Names are those of GRAB and ARCTIC; most shapes are those of the embedded corpora.
+
+Verbs are crossed with objects, hands and regions, over disjoint subjects. In contrast to the embedded corpora, object
+and hand do not determine the verb. Verb, object and hand do not determine the grasped region.
 """
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from hoidata.clips.clip import HandType
+from hoidata.clips.clip import HandType, Side
 from hoidata.synthetic.actions import DATASET_IDS
+from hoidata.synthetic.catalogue import ObjectSpec, box_at, hinged, hinged_behind, object_spec, tilted
+from hoidata.synthetic.grasps import Approach, GraspSpec
 from hoidata.synthetic.paths import Key, Motion, Swing
-from hoidata.synthetic.study_objects import STUDY_OBJECTS, Region, StudyObject
+from hoidata.synthetic.shapes import Solid, cylinder, revolved, rounded_box, united
+
+
+@dataclass(frozen=True)
+class Region:
+    """A grasp region of an object."""
+
+    name: str
+    grasp: GraspSpec
+    yaw_deg: float = 0.0  # rotation of the object on the table
+
+    def standing(self, spec: ObjectSpec) -> ObjectSpec:
+        """Return the spec of the object, rotated for this region."""
+        if not self.yaw_deg:
+            return spec
+        rotation = Rotation.from_euler("z", self.yaw_deg, degrees=True).as_matrix() @ spec.upright_from_object
+        return replace(spec, standing_deg=tuple(Rotation.from_matrix(rotation).as_euler("xyz", degrees=True)))
+
+
+@dataclass(frozen=True)
+class StudyObject:
+    """An object and its grasp regions."""
+
+    spec: ObjectSpec
+    one: tuple[Region, ...]  # regions for one hand
+    two: tuple[Region, ...]  # regions for both hands
+    lids: tuple[tuple[Region, ...], tuple[Region, ...]] = ((), ())  # regions to move the lid, with one and two hands
+    across: bool = False  # plane of symmetry: y = 0, as with a handle to the right, or x = 0
+
+    def regions(self, verb: str, n_hands: int) -> tuple[Region, ...]:
+        """Return the regions that ``n_hands`` hands can grasp for a verb."""
+        return self.lids[n_hands - 1] if verb in ("open", "close") else (self.one, self.two)[n_hands - 1]
+
+    def mirror(self, region: Region) -> np.ndarray:
+        """Return the (3, 3) reflection of the object frame that maps the surface to itself.
+
+        It maps the object, mirrored in x, to the object rotated on the table.
+        """
+        upright = region.standing(self.spec).upright_from_object
+        rotation = Rotation.from_euler("z", (180 if self.across else 0) - 2 * region.yaw_deg, degrees=True).as_matrix()
+        return upright.T @ rotation.T @ np.diag([-1.0, 1.0, 1.0]) @ upright
+
+    def stands_alike(self, right: Region, left: Region) -> bool:
+        """Whether a right hand at one region and a left hand at the other, mirrored, need the same yaw."""
+        return (180 * self.across - left.yaw_deg - right.yaw_deg) % 360 == 0
+
+    @property
+    def all_regions(self) -> tuple[Region, ...]:
+        return (*self.one, *self.two, *self.lids[0], *self.lids[1])
+
+
+Vector = tuple[float, float, float]
+Reaches = tuple[tuple[Side, Approach], ...]
+
+
+def _one(name: str, direction: Vector, through: Vector | None, width=0.3, blend=(0.0, 0.8), yaw=0.0) -> Region:
+    return Region(name, GraspSpec((("right", Approach(direction, width, through, blend)),)), yaw)
+
+
+def _two(name: str, left: tuple, right: tuple, yaw=0.0) -> Region:
+    """left, right: (direction, target point) of each hand."""
+    approaches: Reaches = (
+        ("left", Approach(left[0], 0.25, left[1], (0, 0.7))),
+        ("right", Approach(right[0], 0.25, right[1], (0, 0.7))),
+    )
+    return Region(name, GraspSpec(approaches), yaw)
+
+
+def _lid(name: str, direction: Vector) -> Region:
+    approach = Approach(direction, blend=(0, 0.9), part=1)
+    return Region(name, GraspSpec((("right", approach),), ANGLES[0], ANGLES))
+
+
+def _base_and_lid(name: str, base: Vector, lid: Vector) -> Region:
+    approaches: Reaches = (
+        ("left", Approach(base, 0.45, part=0)),
+        ("right", Approach(lid, 0.45, part=1)),
+    )
+    return Region(name, GraspSpec(approaches, ANGLES[0], ANGLES))
+
+
+# Hinge angles, from closed to open, at which a grasp of the lid must be stable.
+ANGLES = (0.4, 0.65, 0.9)
+
+
+def _frying_pan() -> Solid:
+    pan = revolved([
+        (0, 0), (0.06, 0), (0.068, 0.006), (0.08, 0.045), (0.078, 0.047), (0.073, 0.045), (0.064, 0.012), (0, 0.012),
+    ])  # fmt: skip
+    return united(pan, cylinder(0.014, 0.13).rotated(tilted(80)).moved((0.138, 0, 0.05)))
+
+
+def _flashlight() -> Solid:
+    return revolved([
+        (0, 0), (0.032, 0), (0.034, 0.002), (0.034, 0.035), (0.021, 0.06), (0.021, 0.177), (0.019, 0.18), (0, 0.18),
+    ])  # fmt: skip
+
+
+def _waffle_iron_half(height_m: float, at_m: float) -> Solid:
+    """Half of a round waffle iron, with half of the handle at the front."""
+    plate, grip = cylinder(0.07, height_m), rounded_box((0.024, 0.1, 0.016)).moved((0, -0.11, 0))
+    return united(plate, grip).moved((0, -0.072, at_m))
+
+
+def _waffle_iron_base() -> Solid:
+    return united(_waffle_iron_half(0.03, -0.0155), cylinder(0.035, 0.06).moved((0, -0.072, -0.055)))
+
+
+_FRYING_PAN = ObjectSpec("fryingpan", "frying pan", _frying_pan)
+_FLASHLIGHT = ObjectSpec("flashlight", "flashlight", _flashlight)
+_LOW, _HIGH = (0.85, -0.4, 0.2), (0.85, -0.35, 0.35)
+_ABOVE = (0.25, -0.35, 1.0)
+_LEFT, _RIGHT = (-1.0, -0.15, 0.15), (1.0, -0.15, 0.15)
+
+
+GRAB_STUDY = (
+    StudyObject(
+        object_spec("grab", "mug"),
+        (
+            _one("handle", (1, -0.35, 0.2), (0.079, 0, 0.045), 0.35, (0.0, 0.9)),
+            _one("body", _LOW, (0, 0, 0.04), yaw=180),
+            _one("top", _ABOVE, (0, 0, 0.09), blend=(0.2, 1.0), yaw=180),
+        ),
+        (
+            _two("handle and body", (_LEFT, (0, 0, 0.045)), ((1, -0.35, 0.2), (0.079, 0, 0.045))),
+            _two("sides", (_LEFT, (0, 0, 0.05)), (_RIGHT, (0, 0, 0.05)), 90),
+        ),
+        across=True,
+    ),
+    StudyObject(
+        object_spec("grab", "waterbottle"),
+        (_one("body", _LOW, (0, 0, 0.055)), _one("shoulder", _HIGH, (0, 0, 0.145)), _one("cap", _ABOVE, (0, 0, 0.2))),
+        (
+            _two("low and high", (_LEFT, (0, 0, 0.05)), (_RIGHT, (0, 0, 0.15))),
+            _two("sides", (_LEFT, (0, 0, 0.1)), (_RIGHT, (0, 0, 0.1))),
+        ),
+    ),
+    StudyObject(
+        object_spec("grab", "teapot"),
+        (_one("handle", (0.5, -0.4, 0.9), (0.125, 0, 0.08)), _one("lid", _ABOVE, (0, 0, 0.1), yaw=180)),
+        (
+            _two("handle and body", (_LEFT, (-0.02, 0, 0.05)), ((0.5, -0.4, 0.9), (0.125, 0, 0.08))),
+            _two("sides", (_LEFT, (0, 0, 0.05)), (_RIGHT, (0, 0, 0.05)), 90),
+        ),
+        across=True,
+    ),
+    StudyObject(
+        object_spec("grab", "wineglass"),
+        (_one("stem", _LOW, (0, 0, 0.055)), _one("bowl", _HIGH, (0, 0, 0.135)), _one("rim", _ABOVE, (0, 0, 0.165))),
+        (
+            _two("stem and bowl", (_LEFT, (0, 0, 0.05)), (_RIGHT, (0, 0, 0.14))),
+            _two("sides of the bowl", (_LEFT, (0, 0, 0.135)), (_RIGHT, (0, 0, 0.135))),
+        ),
+    ),
+    StudyObject(
+        _FRYING_PAN,
+        (
+            _one("handle", (0.6, -0.5, 0.8), (0.155, 0, 0.055)),
+            _one("rim", (0.9, -0.3, 0.4), (0.07, 0, 0.035), blend=(0.2, 1.0), yaw=180),
+        ),
+        (
+            _two("handle and rim", (_LEFT, (-0.05, 0, 0.03)), ((0.6, -0.5, 0.8), (0.155, 0, 0.055))),
+            _two("both rims", (_LEFT, None), (_RIGHT, None), 90),
+        ),
+        across=True,
+    ),
+    StudyObject(
+        object_spec("grab", "cylinderlarge"),
+        (_one("low", _LOW, (0, 0, 0.045)), _one("top", _ABOVE, (0, 0, 0.13), blend=(0.2, 1.0))),
+        (
+            _two("low and high", (_LEFT, (0, 0, 0.035)), (_RIGHT, (0, 0, 0.105))),
+            _two("sides", (_LEFT, (0, 0, 0.07)), (_RIGHT, (0, 0, 0.07))),
+        ),
+    ),
+    StudyObject(
+        object_spec("grab", "cubelarge"),
+        (_one("side", _LOW, None), _one("top", _ABOVE, None, blend=(0.2, 1.0))),
+        (
+            _two("sides", (_LEFT, None), (_RIGHT, None)),
+            _two("front and back", ((-0.6, 0.8, 0.2), None), ((0.6, -0.8, 0.2), None)),
+        ),
+    ),
+    StudyObject(
+        _FLASHLIGHT,
+        (_one("head", _LOW, (0, 0, 0.03)), _one("tube", _HIGH, (0, 0, 0.12)), _one("end", _ABOVE, (0, 0, 0.17))),
+        (
+            _two("head and tube", (_LEFT, (0, 0, 0.025)), (_RIGHT, (0, 0, 0.13))),
+            _two("both on the tube", (_LEFT, (0, 0, 0.09)), (_RIGHT, (0, 0, 0.15))),
+        ),
+    ),
+)
+
+_BOX = hinged("box", "box", 0.1, 0.07, 0.07, 0.035)
+_WAFFLE_IRON = hinged_behind("waffleiron", "waffle iron", _waffle_iron_base, lambda: _waffle_iron_half(0.026, 0.0135))
+_CAPSULE_MACHINE = hinged_behind(
+    "capsulemachine",
+    "capsule machine",
+    box_at((0.07, 0.11, 0.14), (0, -0.055, -0.0705), 0.004, 0.015),
+    box_at((0.066, 0.1, 0.025), (0, -0.05, 0.013)),
+)
+_PARTS = ((-1.0, -0.3, 0.0), (1.0, -0.4, 0.4))
+
+
+def _hinged_object(spec: ObjectSpec, *more: Region) -> StudyObject:
+    """Return an object with regions to carry it closed, and regions to move its lid."""
+    return StudyObject(
+        spec,
+        (_one("side", _LOW, None), _one("top", _ABOVE, None, blend=(0.2, 1.0)), *more),
+        (_two("sides", (_LEFT, None), (_RIGHT, None)), _two("side and top", (_LEFT, None), (_ABOVE, None))),
+        (
+            (_lid("side of the lid", (1, -0.4, 0.4)), _lid("front of the lid", (0.1, -1, 0.5))),
+            (
+                _base_and_lid("side of base and lid", *_PARTS),
+                _base_and_lid("base and front of the lid", (-1.0, -0.1, 0.0), (0.1, -1.0, 0.5)),
+            ),
+        ),
+    )
+
+
+ARCTIC_STUDY = tuple(
+    _hinged_object(spec)
+    for spec in (_BOX, object_spec("arctic", "ketchup"), object_spec("arctic", "mixer"), _CAPSULE_MACHINE, _WAFFLE_IRON)
+)
+STUDY_OBJECTS = {"grab": GRAB_STUDY, "arctic": ARCTIC_STUDY}
+
 
 StudySize = Literal["study", "study-small"]
 _UP = (0.0, 0.0, 0.17)

@@ -30,9 +30,8 @@ from hoidata.metrics.target_contact import (
     write_target_distances,
 )
 from hoidata.settings import build_config, require_at_least
-from hoidata.store.annotated import load_annotated
+from hoidata.store.annotated import WindowedStore, WindowProtocol, load_annotated
 from hoidata.store.store import open_store, write_store
-from hoidata.store.windows import WindowedStore, WindowProtocol
 from models.common.checkpoints import FILE_NAME, empty_reason, write_empty
 from models.common.family import Family, Sampler, Skipped, Sources
 

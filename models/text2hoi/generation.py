@@ -13,7 +13,7 @@ import numpy as np
 
 from hoidata.annotation.encoders import TextEncoder, load_encoder
 from hoidata.annotation.hand_choice import HandChoice, Method
-from hoidata.annotation.sentence_check import unseen_words
+from hoidata.annotation.prompts import unseen_words
 from hoidata.annotation.vocabulary import Vocabulary
 from hoidata.annotation.wording import understood_words
 from hoidata.batches.dataset import MAX_FRAMES

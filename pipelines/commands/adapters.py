@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(no_args_is_help=True)
 # The module with the list of verbs and objects, for datasets whose sentences come from such a list.
-TEMPLATED = {"grab": "words", "h2o": "files", "arctic": "files"}
+TEMPLATED = {"grab": "adapter", "h2o": "files", "arctic": "adapter"}
 COLOURS = {"pass": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
 Name = Annotated[str, typer.Argument(help="Name of an adapter, as `hoidata adapters list` shows it.")]
 Root = Annotated[Path, typer.Option(help="Folder with the raw files.", exists=True, file_okay=False, resolve_path=True)]

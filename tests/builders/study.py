@@ -14,7 +14,7 @@ from hoidata.synthetic.study import (
     people_of,
     sample_contact_frames,
 )
-from hoidata.synthetic.study_objects import STUDY_OBJECTS
+from hoidata.synthetic.study_plan import STUDY_OBJECTS
 from tests.builders.clips import clip_of
 
 # Clips of each verb and hand by each subject of the small corpora: training, validation, test.

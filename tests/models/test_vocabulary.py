@@ -3,7 +3,7 @@
 import pytest
 
 from hoidata.annotation.encoders import load_encoder
-from hoidata.annotation.sentence_check import further_verbs, is_english, read_sentence, unseen_words
+from hoidata.annotation.prompts import further_verbs, is_english, read_sentence, unseen_words
 from hoidata.annotation.vocabulary import Vocabulary
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands

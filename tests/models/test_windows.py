@@ -17,9 +17,8 @@ from hoidata.metrics.evaluate import evaluate_store
 from hoidata.metrics.optional_metrics import select_metrics
 from hoidata.metrics.target_contact import read_target_contact
 from hoidata.settings import build_config
-from hoidata.store.annotated import AnnotatedStore, load_annotated
+from hoidata.store.annotated import AnnotatedStore, WindowedStore, WindowProtocol, load_annotated
 from hoidata.store.store import open_store
-from hoidata.store.windows import WindowedStore, WindowProtocol
 from models.common.family import Sources
 from models.common.predicting import PredictionConfig, sample_family
 from models.registry import load_family

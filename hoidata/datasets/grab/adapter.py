@@ -5,6 +5,7 @@ left and right hand, 26 to 40 and 41 to 55 for their fingers. For 4,500 frames a
 take 1.7 GB, so they are read in pieces of a few megabytes.
 """
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +18,6 @@ from hoidata.clips.hand_parameters import HandConvention, SourceHand, to_track
 from hoidata.dataset_folders import facts_of_adapter
 from hoidata.datasets import checks
 from hoidata.datasets.base import AdapterBase, DatasetPart, Quarantined, RawTree, SequenceKey
-from hoidata.datasets.grab.words import object_words, verb_words
 from hoidata.datasets.known_meshes import raw_mesh
 from hoidata.errors import BadInput
 from hoidata.files import load_npz_objects
@@ -25,6 +25,79 @@ from hoidata.files.array_pieces import StoredArray, locate_arrays, npz_members
 from hoidata.geometry.rotations import canonical_rotvec
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
+
+# Verb by ``motion_intent``.
+INTENTS = {
+    **{word: word for word in ("browse", "brush", "call", "chop", "clean", "cook", "drink", "eat", "fly", "inspect")},
+    **{word: word for word in ("lift", "open", "pass", "peel", "play", "pour", "screw", "see", "set", "shake")},
+    **{word: word for word in ("squeeze", "stamp", "staple", "toast", "use", "wear")},
+    "offhand": "hand over",
+    "switchON": "switch on",
+    "takepicture": "take a picture with",
+}
+_SHAPES, _SIZES = ("cube", "cylinder", "pyramid", "sphere", "torus"), ("small", "medium", "large")
+# The 51 manipulated objects; sizes of the plain shapes are part of their words.
+OBJECTS = {
+    **{shape + size: f"{size} {shape}" for shape in _SHAPES for size in _SIZES},
+    **{name: name for name in ("airplane", "apple", "banana", "binoculars", "bowl", "camera", "cup", "doorknob")},
+    **{name: name for name in ("duck", "elephant", "eyeglasses", "flashlight", "flute", "hammer", "hand")},
+    **{name: name for name in ("headphones", "knife", "mouse", "mug", "phone", "scissors", "stamp", "stapler")},
+    **{name: name for name in ("teapot", "toothbrush", "toothpaste", "train", "watch")},
+    "alarmclock": "alarm clock",
+    "fryingpan": "frying pan",
+    "gamecontroller": "game controller",
+    "lightbulb": "light bulb",
+    "piggybank": "piggy bank",
+    "stanfordbunny": "Stanford bunny",
+    "waterbottle": "water bottle",
+    "wineglass": "wine glass",
+}
+# Intents recorded with an object beyond lift, pass and offhand, which GRAB recorded with all but those of ``_NEVER``.
+_RECORDED = {
+    **{shape + size: "inspect" for shape in _SHAPES for size in _SIZES},
+    **{name: "inspect" for name in ("duck", "elephant", "stanfordbunny")},
+    **{name: "use" for name in ("doorknob", "hammer", "headphones", "mouse", "piggybank", "scissors")},
+    **{name: "play" for name in ("flute", "gamecontroller", "train")},
+    **{"airplane": "fly", "alarmclock": "see", "apple": "eat", "banana": "eat peel", "binoculars": "see"},
+    **{"bowl": "drink", "camera": "browse takepicture", "cup": "drink pour", "eyeglasses": "clean wear"},
+    **{"flashlight": "switchON", "fryingpan": "cook", "hand": "inspect shake", "knife": "chop peel"},
+    **{"lightbulb": "screw", "mug": "drink toast", "phone": "call", "stamp": "stamp", "stapler": "staple"},
+    **{"teapot": "pour", "toothbrush": "brush", "toothpaste": "squeeze", "watch": "set"},
+    **{"waterbottle": "drink open pour shake", "wineglass": "drink toast"},
+}
+_NEVER = {
+    "lift": ("lightbulb", "pyramidsmall", "scissors"),
+    "pass": ("doorknob",),
+    "offhand": (
+        "doorknob", "hammer", "knife", "lightbulb", "pyramidsmall", "teapot", "toothbrush", "toothpaste", "toruslarge",
+    ),
+}  # fmt: skip
+# The 202 pairs of verb and object that GRAB has, in words.
+PAIRS = tuple(
+    (INTENTS[intent], words)
+    for name, words in OBJECTS.items()
+    for intent in (*_RECORDED[name].split(), *(general for general, names in _NEVER.items() if name not in names))
+)
+# Further meshes in GRAB's folder of objects.
+OTHER_MESHES = {
+    "coffeemug": "coffee mug",
+    "cubemiddle": "middle cube",
+    "rubberduck": "rubber duck",
+    "table": "table",
+    "wristwatch": "wristwatch",
+}
+_BEFORE_CAPITAL = re.compile(r"(?<=[a-z])(?=[A-Z])|[_\s-]+")
+
+
+def verb_words(intent: str) -> str | None:
+    """The verb of an intent. An unknown intent is split at capitals, ``_``, ``-`` and blanks; "" gives None."""
+    return INTENTS.get(intent) or " ".join(_BEFORE_CAPITAL.split(intent)).strip().lower() or None
+
+
+def object_words(name: str) -> str:
+    """GRAB's joined object name in words, size first: ``cubelarge`` is "large cube". Unknown names are unchanged."""
+    return OBJECTS.get(name) or OTHER_MESHES.get(name, name)
+
 
 TOP_FOLDERS = ("", "GRAB")
 FRAME = WorldFrame("+z", "stated", "GRAB's motion-capture world, right-handed, z up, metres")
@@ -78,11 +151,8 @@ class GrabAdapter(AdapterBase):
         contact = read_contact(source.file, source.path, source.n_frames, len(model.vertices_m), step, self.contact)
         start, stop = _contact_range(source, contact.touched, self.margin_frames)
         frames = np.arange(start * step, stop * step, step)
-        clip = Clip(
-            clip_id=str(key),
-            dataset=self.name,
-            subject=key.subject,
-            sequence=key.name,
+        clip = self.new_clip(
+            key,
             hands={side: _hand(raw, source, side, frames, hands) for side in SIDES},
             object=_object_track(source, "object", model, frames),
             other_objects=_table(raw, source, frames),
@@ -251,13 +321,7 @@ class ContactLabels:
 def read_contact(file: Path, path: str, n_frames: int, n_vertices: int, step: int, with_labels: bool) -> ContactLabels:
     """Read the contact labels of every ``step``-th frame from frame 0 on. Raises BadInput.
 
-    Args:
-        file: the NPZ file.
-        path: of the file, for errors.
-        n_frames: required number of frames.
-        n_vertices: of the object's mesh.
-        step: use every step-th frame.
-        with_labels: return the labels, not only whether a frame has one.
+    path: for errors. with_labels: return the labels, not only whether a frame has one.
     """
     location = f"{path}: contact.object"
     array = locate_arrays(file, "contact").get("object")
@@ -306,16 +370,8 @@ def _checked(location: str, labels: np.ndarray) -> np.ndarray:
 
 
 def _joined(parts: list[SourceContact], by_columns: bool) -> SourceContact:
-    """Concatenate parts, sorted by frame and vertex. Empties ``parts`` to save memory."""
-    n_labels = sum(len(part.frame) for part in parts)
-    whole = SourceContact(*(np.empty(n_labels, dtype) for dtype in (np.int32, np.int32, np.uint8)))
-    stop = n_labels
-    while parts:
-        part = parts.pop()
-        start = stop - len(part.frame)
-        whole.frame[start:stop], whole.vertex[start:stop], whole.label[start:stop] = part.frame, part.vertex, part.label
-        stop = start
-    if not by_columns:
-        return whole
-    order = np.lexsort((whole.vertex, whole.frame))
-    return SourceContact(whole.frame[order], whole.vertex[order], whole.label[order])
+    """Concatenate parts, sorted by frame and vertex."""
+    empty = SourceContact(np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.uint8))
+    frame, vertex, label = (np.concatenate([vars(part)[name] for part in (empty, *parts)]) for name in vars(empty))
+    order = np.lexsort((vertex, frame)) if by_columns else slice(None)
+    return SourceContact(frame[order], vertex[order], label[order])

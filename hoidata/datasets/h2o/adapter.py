@@ -20,14 +20,17 @@ from hoidata.datasets.gaps import bridge, has_pose, mark_interpolated, missing_p
 from hoidata.datasets.gravity import GravityEstimate, TrackedObject, estimate_gravity
 from hoidata.datasets.h2o.files import (
     ACTIONS,
+    FITTED,
     LISTS,
     OBJECTS,
+    PARAMETERS,
     HandSource,
+    KeypointHands,
+    ParameterHands,
     SequenceFrames,
     listed_segments,
     read_frames,
 )
-from hoidata.datasets.h2o.hands import FITTED, PARAMETERS, KeypointHands, ParameterHands
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import Interval, runs, widened
 from hoidata.geometry.rotations import rotmat_to_rotvec
@@ -144,11 +147,9 @@ class H2OAdapter(AdapterBase):
         world_from_object = frames.camera[start:stop] @ _poses(frames)[start:stop]
         tracks, fit_error_m = sequence.hands.tracks(start, stop)
         source_frames = np.arange(frames.first + start, frames.first + stop, dtype=np.int32)
-        return Clip(
+        return self.new_clip(
+            sequence.key,
             clip_id=_clip_id(sequence.key, frames, run.start, run.stop),
-            dataset=self.name,
-            subject=sequence.key.subject,
-            sequence=sequence.key.name,
             hands=tracks,
             object=bridge(
                 ObjectTrack(
@@ -163,7 +164,6 @@ class H2OAdapter(AdapterBase):
             gravity_note=sequence.gravity.note,
             verb=run.verb,
             object_words=run.noun,
-            source_fps=self.source_fps,
             sources=sequence.sources,
             hands_from="parameters" if self.needs_mano else "keypoints",
             fit_error_m=fit_error_m,
@@ -183,8 +183,7 @@ def _labelled_ranges(
 ) -> Iterator[tuple[int, int, int | None, str]]:
     """Yield start, stop (exclusive), action label and location of each run, from labels or from a segment list.
 
-    Raises:
-        BadInput: neither labels nor a list, or the list names missing frames.
+    Raises BadInput without labels and list, or if the list names missing frames.
     """
     if frames.label is not None and frames.label.any():
         for start, stop in label_runs(frames.label):
@@ -243,13 +242,7 @@ def _clip_id(key: SequenceKey, frames: SequenceFrames, start: int, stop: int) ->
 def _camera_track(frames: SequenceFrames, start: int, stop: int, images: np.ndarray) -> CameraTrack:
     poses = frames.camera[start:stop]
     rotvec = rotmat_to_rotvec(poses[:, :3, :3]).astype(np.float32)
-    return CameraTrack(
-        name=CAMERA,
-        rotvec=rotvec,
-        position_m=poses[:, :3, 3].astype(np.float32),
-        images=images,
-        intrinsics=frames.intrinsics,
-    )
+    return CameraTrack(CAMERA, rotvec, poses[:, :3, 3].astype(np.float32), images, intrinsics=frames.intrinsics)
 
 
 def _tracked_objects(frames: SequenceFrames, objects: dict[str, _Object]) -> list[TrackedObject]:

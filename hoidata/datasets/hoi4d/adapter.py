@@ -26,15 +26,13 @@ from hoidata.datasets.hoi4d.files import (
     PartPose,
     ShortPose,
     action_events,
+    aligned_from_whole,
     camera_poses,
     frame_numbers,
     hand_frame,
     hinge_joint,
-    object_poses,
-)
-from hoidata.datasets.hoi4d.parts import (
-    aligned_from_whole,
     match_boxes,
+    object_poses,
     upsample_frames,
     upsample_hand,
     upsample_rotvecs,
@@ -83,6 +81,7 @@ PARTS = (
     ),
 )
 EVENT_FILES = (f"{ANNOTATIONS}/{CLIP}/action/color.json",)
+EVENT_PART = DatasetPart("events", EVENT_FILES, "HOI4D_annotations.zip", unneeded_with="clips=segments")
 
 
 class _ObjectMotion(NamedTuple):
@@ -122,15 +121,7 @@ class Hoi4dAdapter(AdapterBase):
     @property
     def parts(self) -> tuple[DatasetPart, ...]:
         """Files of a complete raw folder. Events are required for the setting ``clips: described`` only."""
-        optional = self.clips != "described"
-        events = DatasetPart(
-            contents="events",
-            patterns=EVENT_FILES,
-            archive="HOI4D_annotations.zip",
-            optional=optional,
-            unneeded_with="clips=segments",
-        )
-        return (*PARTS, events)
+        return (*PARTS, replace(EVENT_PART, optional=self.clips != "described"))
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per recording that has a folder of annotations. The subject is the person, ``H2``."""
@@ -152,11 +143,8 @@ class Hoi4dAdapter(AdapterBase):
             images=upsample_frames(len(camera)).astype(np.int32),
         )
         gravity, gravity_note = _gravity(object_motion, tracks, camera, hands)
-        whole = Clip(
-            clip_id=str(key),
-            dataset=self.name,
-            subject=key.subject,
-            sequence=key.name,
+        whole = self.new_clip(
+            key,
             hands=tracks,
             object=object_motion.track,
             source_frames=mark_interpolated(camera_track.images, object_motion.recorded),
@@ -165,7 +153,6 @@ class Hoi4dAdapter(AdapterBase):
             verb=None,
             object_words=category.words,
             sources=raw.sources,
-            source_fps=self.source_fps,
             camera=camera_track,
         )
         clips = self._cut(whole, camera_track.images, ranges, object_motion)
@@ -211,11 +198,8 @@ class Hoi4dAdapter(AdapterBase):
             start, stop = event.start, min(event.stop, n_frames)
             word, clip_id = event.word.lower(), f"{key}/{start:04d}-{stop:04d}"
             if word not in EVENTS:
-                expected = f"one of {', '.join(EVENTS)}"
-                got = repr(event.word)[:40]
-                unknown_events.append(
-                    Quarantined(clip_id, where=path, expected=expected, got=got, remedy="nothing to do")
-                )
+                problem = BadInput(path, f"one of {', '.join(EVENTS)}", repr(event.word)[:40], "nothing to do")
+                unknown_events.append(Quarantined.from_error(clip_id, problem))
             elif (action := EVENTS[word]) is not None and stop > start:
                 verb, hand = action
                 ranges[start, stop] = _ClipRange(clip_id, start=start, stop=stop, verb=verb, hand=hand)
@@ -376,11 +360,7 @@ def _object_motion(
     recorded = np.zeros(track.n_frames, bool)
     recorded[::2] = tracked
     return _ObjectMotion(
-        track=bridge(track, has_pose_or_neighbours),
-        tracked=has_pose_or_neighbours,
-        recorded=recorded,
-        note=note,
-        rejected_frames=rejected_frames,
+        bridge(track, has_pose_or_neighbours), has_pose_or_neighbours, recorded, note, rejected_frames=rejected_frames
     )
 
 
@@ -426,9 +406,7 @@ def _source_hand(raw: RawTree, key: SequenceKey, side: Side, n_frames: int) -> t
             continue
         pose[frame], betas[frame], translation_m[frame], valid[frame] = *hand[:2], hand.translation_m, True
     betas[~valid] = betas[valid][0] if valid.any() else 0
-    source = SourceHand(
-        translation_m=translation_m, global_orient=pose[:, :3], fingers=pose[:, 3:], betas=betas, valid=valid
-    )
+    source = SourceHand(translation_m, pose[:, :3], pose[:, 3:], betas, valid=valid)
     return source, faulty
 
 

@@ -28,8 +28,7 @@ from hoidata.datasets.gaps import (
     trim_to_recorded,
 )
 from hoidata.datasets.hinge import box_corners
-from hoidata.datasets.hot3d.files import HandFormat, Poses, object_words
-from hoidata.datasets.hot3d.sources import PARTS, Profile, Source, joints_m, read_source
+from hoidata.datasets.hot3d.files import PARTS, HandFormat, Poses, Profile, Source, joints_m, object_words, read_source
 from hoidata.datasets.segments import segment_clips
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import Interval, bridged, runs, split_evenly, widened
@@ -148,11 +147,9 @@ class Hot3dAdapter(AdapterBase):
         recording = _recording(raw, source, hands)
         source_from_world = np.eye(4)
         source_from_world[:3, :3] = WORLD_FROM[source.headset].T
-        whole = Clip(
-            clip_id=str(key),
-            dataset=self.name,
+        whole = self.new_clip(
+            key,
             subject=source.subject,
-            sequence=key.name,
             hands=recording.hands.tracks,
             object=recording.objects[0].track,
             source_frames=np.arange(len(recording.times_ns), dtype=np.int32),
@@ -160,7 +157,6 @@ class Hot3dAdapter(AdapterBase):
             verb=None,
             object_words="",
             source_from_world=source_from_world,
-            source_fps=self.source_fps,
             hands_from="keypoints" if source.profile else "parameters",
             sources=raw.sources,
         )
@@ -183,21 +179,15 @@ class Hot3dAdapter(AdapterBase):
             intervals = self._intervals(
                 recorded_object, recorded_object.has_pose & ~recording.failed, recording.times_ns, joints_m
             )
-            gaps = missing_poses(
+            yield from missing_poses(
                 f"{whole.clip_id}/{name}/missing", whole.sequence, name, whole.source_frames, recorded_object.tracked
             )
-            yield from gaps
             if intervals.cut:
                 expected = f"touches of {self.shortest_frames} frames between missing poses of the object or a hand"
                 yield _rejected(whole, f"{name}/cut", expected, intervals.cut, LOWER_SHORTEST_FRAMES)
             if intervals.short:
-                yield _rejected(
-                    whole,
-                    f"{name}/short",
-                    f"touches of {self.shortest_frames} frames",
-                    intervals.short,
-                    LOWER_SHORTEST_FRAMES,
-                )
+                expected = f"touches of {self.shortest_frames} frames"
+                yield _rejected(whole, f"{name}/short", expected, intervals.short, LOWER_SHORTEST_FRAMES)
             if intervals.still:
                 yield _rejected(whole, f"{name}/still", f"an object that moves {100 * MOVED_M:g} cm", intervals.still)
             for interval in intervals.clips:
@@ -224,13 +214,9 @@ class Hot3dAdapter(AdapterBase):
         if mean_m * 1000 <= self.most_fit_error_mm:
             return replace(clip, fit_error_m=mean_m)
         expected = f"hands that miss UmeTrack's joints by {self.most_fit_error_mm} mm or less on average"
-        return Quarantined(
-            clip_id,
-            where=recording.source.path,
-            expected=expected,
-            got=f"{1000 * mean_m:.1f} mm",
-            remedy="nothing to do, or raise the setting most_fit_error_mm",
-        )
+        remedy = "nothing to do, or raise the setting most_fit_error_mm"
+        problem = BadInput(recording.source.path, expected, f"{1000 * mean_m:.1f} mm", remedy)
+        return Quarantined.from_error(clip_id, problem)
 
     def _intervals(
         self, recorded_object: _RecordedObject, usable: np.ndarray, times: np.ndarray, joints_m: np.ndarray
@@ -266,29 +252,14 @@ def _recording(raw: RawTree, source: Source, hands: HandPair) -> _Recording:
     objects = [
         _recorded_object(raw, *source.models[key], poses, times, world) for key, poses in source.object_poses.items()
     ]
-    return _Recording(
-        source=source,
-        times_ns=times,
-        failed=rows_of_frames(times, source.failed_ns) >= 0,
-        hands=hand_tracks,
-        objects=objects,
-    )
+    return _Recording(source, times, rows_of_frames(times, source.failed_ns) >= 0, hand_tracks, objects=objects)
 
 
 def frame_times(path: str, times_ns: list[np.ndarray]) -> np.ndarray:
-    """Merge the times of all files to frames.
+    """Merge the times of all files to frames: (frame,) int64, the first time of each frame in ns.
 
     Times within 2 ms belong to one frame. Gaps of up to three frames are filled, so that poses can be interpolated.
-
-    Args:
-        path: for errors.
-        times_ns: times of each file.
-
-    Returns:
-        (frame,) int64, first time of each frame in ns.
-
-    Raises:
-        BadInput: frames are closer than half of 1/30 s.
+    Raises BadInput for frames closer than half of 1/30 s.
     """
     times = np.unique(np.concatenate(times_ns))
     first = times[np.r_[True, np.diff(times) > MAX_SAME_FRAME_NS]]
@@ -396,13 +367,10 @@ def _moves(track: ObjectTrack, interval: Interval) -> bool:
 
 
 def _is_cut(interval: Interval, is_tracked: np.ndarray) -> bool:
-    """Whether tracking of the object or a hand begins or ends at the ends of the interval.
+    """Whether tracking of the object or a hand begins or ends at the ends of a contact interval.
 
     A hand that is untracked on both sides of an end does not count, because the other hand touches.
-
-    Args:
-        interval: a contact interval.
-        is_tracked: (object and hands, frame) bool.
+    is_tracked: (object and hands, frame) bool.
     """
     ends = (interval.start, interval.start - 1), (interval.stop - 1, interval.stop)
     return any((is_tracked[:, a] & ~is_tracked[:, b]).any() for a, b in ends if 0 <= b < is_tracked.shape[1])

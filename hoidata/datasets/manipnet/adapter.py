@@ -189,11 +189,8 @@ class ManipNetAdapter(AdapterBase):
         """The frames of an interval as a clip. The caller replaces id, verb and sources."""
         frames = slice(*interval)
         fits = fit_hands({side: points[frames] for side, points in recording.keypoints_m.items()}, hands, betas)
-        return Clip(
-            clip_id=str(key),
-            dataset=self.name,
-            subject=key.subject,
-            sequence=key.name,
+        return self.new_clip(
+            key,
             hands={side: hand_track(f.wrist_m, f.global_orient, f.hand_pose, f.betas) for side, f in fits.items()},
             object=ObjectTrack(
                 recording.model,
@@ -281,15 +278,9 @@ def _hand_track(motion: BvhMotion) -> SourceHandTrack:
 
 
 def keypoints_m(motion: BvhMotion, side: Side, tips: dict[str, np.ndarray]) -> np.ndarray:
-    """World keypoints of a hand in hoidata's order.
+    """World keypoints (frame, 21, 3) of a right-handed hand motion in hoidata's order, metres.
 
-    Args:
-        motion: of the hand, right-handed.
-        side: of the hand.
-        tips: fingertip by joint in the joint's frame, of the right hand, right-handed, source units.
-
-    Returns:
-        (frame, 21, 3) metres.
+    tips: fingertip by joint in the joint's frame, of the right hand, right-handed, source units.
     """
     positions, rotations = motion.world_joints()
     index = {joint: i for i, joint in enumerate(motion.names)}

@@ -241,7 +241,9 @@ def read_hand(raw: RawTree, skeleton: BvhMotion) -> TrackedHand:
     joint_from_skin = _MIRROR @ _rigid(skin["bind_poses"]) @ _MIRROR
     offset_m = skeleton.offsets * METRES_PER_UNIT
     offset_m[0] = 0.0
-    tips = np.array([np.flatnonzero(capsules.joint == joint)[0] for joint in _last_joints(skeleton.parents)])
+    # Joints without children, one per finger: thumb, index, middle, ring, pinky.
+    last_joints = np.setdiff1d(np.arange(len(skeleton.parents)), skeleton.parents)
+    tips = np.array([np.flatnonzero(capsules.joint == joint)[0] for joint in last_joints])
     rest = _rest_rotmats(joint_from_skin, skeleton)
     hinge, limits = _hinges(skeleton.names)
     to_joint = RigidTransform(joint_from_skin[:, :3, :3], joint_from_skin[:, :3, 3] * METRES_PER_UNIT)
@@ -339,11 +341,6 @@ def _smallest_rotation(from_direction: np.ndarray, to_direction: np.ndarray) -> 
     x, y, z = np.cross(a, b)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + cross + cross @ cross / (1 + a @ b)
-
-
-def _last_joints(parents: np.ndarray) -> np.ndarray:
-    """Joints without children, one per finger: thumb, index, middle, ring, pinky."""
-    return np.setdiff1d(np.arange(len(parents)), parents)
 
 
 def _hinges(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -98,12 +98,7 @@ def interactions(usable: np.ndarray, touched: np.ndarray, lifted: np.ndarray) ->
 
     Gaps in contact of at most 10 frames are ignored. Each lift forms an interval with up to 15 frames of contact before
     and after it. The remaining contact forms an interval, or joins the lift if it is shorter than 45 frames. Long
-    intervals are split evenly.
-
-    Args:
-        usable: (frame,) bool.
-        touched: (frame,) bool, a hand is at the object.
-        lifted: (frame,) bool, the object is above the table.
+    intervals are split evenly. usable, touched (a hand is at the object), lifted (above the table): (frame,) bool.
     """
     pieces: list[Interval] = []
     for touch in runs(bridged(touched, MAX_CONTACT_GAP_FRAMES) & usable):
@@ -124,11 +119,7 @@ def motion_verb(lift_m: np.ndarray, centre_m: np.ndarray, rotation: np.ndarray) 
     - It is on the table throughout: "turn" from 30 degrees, else "move" from 3 cm, else None.
 
     Phases of fewer than 5 frames in the air or on the table are ignored.
-
-    Args:
-        lift_m: (frame,) height of its lowest point above the table.
-        centre_m: (frame, 3).
-        rotation: (frame, 3, 3).
+    lift_m: (frame,) height of its lowest point above the table. centre_m: (frame, 3). rotation: (frame, 3, 3).
     """
     lifted = _without_brief(lift_m > LIFTED_M)
     moved_m = np.linalg.norm(centre_m - centre_m[0], axis=1).max()

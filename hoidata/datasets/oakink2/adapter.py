@@ -136,19 +136,13 @@ class Oakink2Adapter(AdapterBase):
             actions = [(_whole(annotation, item), [item]) for item in scene.objects_of(list(annotation.parts))]
         described_in = program_path if has_program else path
         for segment, objects in actions:
-            reason = _unusable_reason(segment, objects)
-            if reason is not None:
-                expected, got = reason
-                name = f"{key}/{segment.name}"
-                results.append(
-                    Quarantined(name, where=described_in, expected=expected, got=got, remedy="nothing to do")
-                )
+            if reason := _unusable_reason(segment, objects):
+                problem = BadInput(described_in, *reason, "nothing to do")
+                results.append(Quarantined.from_error(f"{key}/{segment.name}", problem))
                 continue
-            whole = Clip(
+            whole = self.new_clip(
+                key,
                 clip_id=f"{key}/{segment.name}",
-                dataset=self.name,
-                subject=key.subject,
-                sequence=key.name,
                 hands=tracks,
                 object=objects[0].track,
                 source_frames=annotation.frames.astype(np.int32),
@@ -157,7 +151,6 @@ class Oakink2Adapter(AdapterBase):
                 object_words=str(objects[0].words),
                 labelled_hand=segment.hand,
                 other_objects=tuple(other.track for other in objects[1:]),
-                source_fps=self.source_fps,
                 gravity_note="; ".join(
                     [GRAVITY_NOTE, *(scene_object.note for scene_object in objects if scene_object.note)]
                 ),
@@ -310,11 +303,7 @@ class Scene:
         last_tracked = np.clip(np.searchsorted(frames, np.arange(len(tracked)), side="right") - 1, 0, None)
         track = _track(model, fit.world_from_object[last_tracked], fit.hinge_rad[last_tracked])
         return SceneObject(
-            track=bridge(track, used_frames),
-            tracked=used_frames,
-            words=words,
-            note=f"{model.name}: {fit.note}",
-            rejected_frames=rejected_frames,
+            bridge(track, used_frames), used_frames, words, f"{model.name}: {fit.note}", rejected_frames=rejected_frames
         )
 
 

@@ -226,9 +226,7 @@ def _hand(location: str, by_frame: Any, side: Side, frames: np.ndarray) -> Sourc
         for value, array in zip(values, arrays, strict=True):
             value[valid] = array
     pose, translation_m, betas = values
-    return SourceHand(
-        translation_m=translation_m, global_orient=pose[:, :3], fingers=pose[:, 3:], betas=betas, valid=valid
-    )
+    return SourceHand(translation_m, pose[:, :3], pose[:, 3:], betas, valid=valid)
 
 
 def _rotvecs(location: str, wxyz: np.ndarray, frames: np.ndarray) -> np.ndarray:

@@ -74,11 +74,8 @@ class TacoAdapter(AdapterBase):
         tool, target = (_object(raw, key, kind) for kind in ("tool", "target"))
         if target.n_frames != tool.n_frames:
             raise BadInput(f"{OBJECTS}/{key.name}/target", f"{tool.n_frames} frames as the tool", f"{target.n_frames}")
-        whole = Clip(
-            clip_id=str(key),
-            dataset=self.name,
-            subject=key.subject,
-            sequence=key.name,
+        whole = self.new_clip(
+            key,
             hands={side: to_track(hand, CONVENTION, hands[side]) for side, hand in _hands(raw, key, tool).items()},
             object=tool,
             other_objects=(target,),
@@ -87,20 +84,15 @@ class TacoAdapter(AdapterBase):
             gravity_note=GRAVITY_NOTE,
             verb=verb,
             object_words=tool_word,
-            source_fps=self.source_fps,
         )
         start, stop = _contact_range(whole, hands)
         clip = whole.take(slice(max(0, start - self.margin_frames), stop + self.margin_frames))
         without_shape: list[Side] = [side for side in SIDES if not _has_shape(raw, key, side)]
         notes = [clip.gravity_note, *(SHAPE_NOTE.format(side=side) for side in without_shape)]
+        remedy = "nothing to do: the clip has zero betas, as TACO's own loader gives them"
+        absent = "the shape of the hand", "no file", remedy
         reasons = [
-            Quarantined(
-                f"{key}/{side}-shape",
-                where=_shape_path(key, side),
-                expected="the shape of the hand",
-                got="no file",
-                remedy="nothing to do: the clip has zero betas, as TACO's own loader gives them",
-            )
+            Quarantined.from_error(f"{key}/{side}-shape", BadInput(_shape_path(key, side), *absent))
             for side in without_shape
         ]
         return [replace(clip, sources=raw.sources, gravity_note="; ".join(notes)), *reasons]
@@ -120,15 +112,7 @@ def frames_by_side(folder: str, keys: Mapping[Side, list[Hashable]], n_frames: i
     """Map each side's keys to frames. Keys are numbers, and a side may lack some.
 
     If a side has one key per frame, its sorted keys are the frames in order. If neither side is complete, the numbers
-    must be 0 to n - 1 or 1 to n, as the first and last number show.
-
-    Args:
-        folder: of the recording, for errors.
-        keys: of both sides.
-        n_frames: number of frames of the objects.
-
-    Raises:
-        BadInput: the numbering is ambiguous, or a number is out of range.
+    must be 0 to n - 1 or 1 to n, as the first and last number show; else BadInput is raised.
     """
     numbers: dict[Side, dict[Hashable, int]] = {
         side: _numbers(f"{folder}/{side}_hand.pkl", keys[side], n_frames) for side in SIDES
@@ -213,13 +197,7 @@ def _hand(
         pose[frame] = _single_row(f"{location}.hand_pose", checks.entry(location, entry, "hand_pose"), 48)
         translation_m[frame] = _single_row(f"{location}.hand_trans", checks.entry(location, entry, "hand_trans"), 3)
         valid[frame] = True
-    return SourceHand(
-        translation_m=translation_m,
-        global_orient=pose[:, :3],
-        fingers=pose[:, 3:],
-        betas=_betas(raw, key, side),
-        valid=valid,
-    )
+    return SourceHand(translation_m, pose[:, :3], pose[:, 3:], _betas(raw, key, side), valid=valid)
 
 
 def _dictionary(raw: RawTree, path: str) -> Mapping[Hashable, Any]:

@@ -12,9 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hoidata.annotation import clip_weights
-from hoidata.annotation.clip_encoder import read_tower
-from hoidata.annotation.clip_weights import is_reachable, parse_weights_name, tagged_weights
+from hoidata.annotation import clip_encoder
+from hoidata.annotation.clip_encoder import is_reachable, parse_weights_name, read_tower, tagged_weights
 from hoidata.annotation.encoders import load_encoder
 from hoidata.errors import BadInput, MissingResource
 
@@ -51,8 +50,8 @@ def test_a_cached_tag_needs_no_network(monkeypatch: pytest.MonkeyPatch) -> None:
         requests.append((repository, file))
         return Path("/cache") / file
 
-    monkeypatch.setattr(clip_weights, "_cached", cached)
-    monkeypatch.setattr(clip_weights, "is_reachable", lambda *_: pytest.fail("looked"))
+    monkeypatch.setattr(clip_encoder, "_cached", cached)
+    monkeypatch.setattr(clip_encoder, "is_reachable", lambda *_: pytest.fail("looked"))
     assert tagged_weights(OPEN_CLIP, "openai") == (Path("/cache/open_clip_model.safetensors"), True)
     assert tagged_weights(OPEN_CLIP, "laion2b") == (Path("/cache/weights.safetensors"), False)
     assert requests == [("timm/vit.openai", "open_clip_model.safetensors"), ("laion/vit", "weights.safetensors")]
@@ -61,9 +60,9 @@ def test_a_cached_tag_needs_no_network(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(("tag", "gelu"), [("openai", "true"), ("laion2b", "false")])
 def test_offline_the_remedy_names_the_activation_of_the_tag(monkeypatch: pytest.MonkeyPatch, tag, gelu) -> None:
     pytest.importorskip("huggingface_hub")
-    monkeypatch.setattr(clip_weights, "_cached", lambda *_: None)
+    monkeypatch.setattr(clip_encoder, "_cached", lambda *_: None)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
-    monkeypatch.setattr(clip_weights, "is_reachable", lambda *_: False)
+    monkeypatch.setattr(clip_encoder, "is_reachable", lambda *_: False)
     with pytest.raises(MissingResource, match=rf"cannot be reached.*quick_gelu={gelu}.*annotate\.encoder: use"):
         tagged_weights(OPEN_CLIP, tag)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
@@ -90,7 +89,7 @@ def test_a_silent_name_server_costs_no_more_than_the_time_given(monkeypatch: pyt
 
 
 def test_a_listening_address_is_reachable_and_a_closed_port_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clip_weights, "getproxies", dict)
+    monkeypatch.setattr(clip_encoder, "getproxies", dict)
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         assert is_reachable(f"http://127.0.0.1:{port}")
@@ -101,7 +100,7 @@ def test_a_listening_address_is_reachable_and_a_closed_port_is_not(monkeypatch: 
 def test_behind_a_proxy_the_proxy_is_tried(monkeypatch: pytest.MonkeyPatch, scheme: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         proxy = f"{scheme}127.0.0.1:{server.getsockname()[1]}"
-        monkeypatch.setattr(clip_weights, "getproxies", lambda: {"https": proxy})
+        monkeypatch.setattr(clip_encoder, "getproxies", lambda: {"https": proxy})
         assert is_reachable("https://nowhere.invalid")
 
 

@@ -9,15 +9,14 @@ import pytest
 from hoidata.annotation.hand_choice import HAND_TYPES
 from hoidata.annotation.prompts import Lexicon, read_prompt
 from hoidata.annotation.sentences import english_sentences, reference_sentences, reference_words
-from hoidata.datasets.arctic import files as arctic
-from hoidata.datasets.grab import words as grab
-from hoidata.datasets.grab.words import OBJECTS
+from hoidata.datasets.arctic import adapter as arctic
+from hoidata.datasets.grab import adapter as grab
 from hoidata.datasets.h2o import files as h2o
 
 # Every verb with every object: 36 of H2O's pairs, 202 of GRAB's and 55 of ARCTIC's are real actions.
 PAIRS = [
     *product(sorted({verb for verb, _ in h2o.PAIRS}), sorted({noun for _, noun in h2o.PAIRS})),
-    *product(grab.INTENTS.values(), OBJECTS.values()),
+    *product(grab.INTENTS.values(), grab.OBJECTS.values()),
     *product(arctic.VERBS, map(arctic.object_words, arctic.OBJECTS)),
 ]
 
@@ -63,7 +62,9 @@ def test_all_prompts_over_all_verbs_objects_and_hands_read_back() -> None:
 def test_the_references_forms_read_back_but_for_the_sizes_they_leave_out() -> None:
     """ "cube" may be any of three; every other object, hand and verb is read."""
     sized = {
-        noun for noun in OBJECTS.values() if reference_words(noun) in ("cube", "cylinder", "pyramid", "sphere", "torus")
+        noun
+        for noun in grab.OBJECTS.values()
+        if reference_words(noun) in ("cube", "cylinder", "pyramid", "sphere", "torus")
     }
     hand, noun_accuracy, verb = shares(reference_sentences, lambda noun: "" if noun in sized else noun)
     assert len(sized) == 15

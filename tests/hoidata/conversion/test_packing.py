@@ -25,9 +25,7 @@ def round_trip(value):
     packer = Packer(share)
     text = json.dumps(packer.pack(value))
     assert packer.shared == set(shared_arrays)
-    return unpack(
-        json.loads(text), np.frombuffer(b"".join(packer.blocks), np.uint8), shared_arrays.__getitem__
-    ), shared_arrays
+    return unpack(json.loads(text), packer.arrays, shared_arrays.__getitem__), shared_arrays
 
 
 def bits(value):

@@ -37,6 +37,9 @@ class FileProblem(NamedTuple):
     message: str  # part of the error's text
 
 
+Problem = tuple[str, str, Corrupt, str]  # the fields of ``FileProblem``
+
+
 class AdapterContract:
     """Tests of one adapter. A subclass sets the class variables and implements ``write`` and ``file_problems``."""
 
@@ -55,12 +58,12 @@ class AdapterContract:
         raise NotImplementedError
 
     @staticmethod
-    def file_problems() -> Iterable[FileProblem]:
+    def file_problems() -> Iterable[Problem]:
         """Problems of the table in ``hoidata/files/README.md``, tested through a whole conversion."""
         raise NotImplementedError
 
     @staticmethod
-    def format_problems() -> Iterable[FileProblem]:
+    def format_problems() -> Iterable[Problem]:
         """Problems of this format alone, tested on one sequence."""
         return ()
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hoidata.datasets.arctic.files import parse_parts
+from hoidata.datasets.arctic.adapter import parse_parts
 from hoidata.datasets.base import RawTree
 from hoidata.datasets.checks import table
 from hoidata.datasets.h2o.files import listed_segments

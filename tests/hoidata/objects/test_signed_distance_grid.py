@@ -7,7 +7,7 @@ from hoidata.objects.distance import closest_points
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.signed_distance_grid import DistanceFields
 from hoidata.objects.surface_index import surface_index
-from hoidata.synthetic.closing import grid_field
+from hoidata.synthetic.hand_capsules import grid_field
 from hoidata.synthetic.shapes import sphere
 from tests.builders.objects import igl_signed_m
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips import SIDES
-from hoidata.splits.leaks import PROMISES, find_leaks
+from hoidata.splits.definitions import PROMISES, find_leaks
 from hoidata.splits.statistics import QUANTILES, summary, training_statistics
 from hoidata.store.info import generated_info
 from hoidata.store.store import open_store, write_store

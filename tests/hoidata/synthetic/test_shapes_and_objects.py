@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from hoidata.datasets.grab.words import OBJECTS as GRAB_WORDS
+from hoidata.datasets.grab.adapter import OBJECTS as GRAB_WORDS
 from hoidata.datasets.h2o.adapter import ACTIONS
 from hoidata.objects.mesh import mass_properties
 from hoidata.objects.surface_index import PartSurface, surface_index
 from hoidata.splits.definitions import published
 from hoidata.synthetic.catalogue import OBJECTS, object_model, object_spec
-from hoidata.synthetic.closing import gradient, grid_field, mirrored
+from hoidata.synthetic.hand_capsules import gradient, grid_field, mirrored
 from hoidata.synthetic.shapes import cylinder, revolved, rounded_box, sharp_box, sphere, torus, united
 from tests.builders.objects import igl_signed_m
 

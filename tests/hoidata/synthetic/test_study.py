@@ -17,8 +17,7 @@ from hoidata.synthetic.check import check_sequences
 from hoidata.synthetic.corpus import write_corpus
 from hoidata.synthetic.paths import follow_path
 from hoidata.synthetic.soundness import measure, vertex_distances_m
-from hoidata.synthetic.study_objects import STUDY_OBJECTS
-from hoidata.synthetic.study_plan import HANDOVER, VERBS, choices, shares, study_plan, verbs_of
+from hoidata.synthetic.study_plan import HANDOVER, STUDY_OBJECTS, VERBS, choices, shares, study_plan, verbs_of
 from tests.builders.objects import igl_signed_m
 
 DATASETS = tuple(STUDY_OBJECTS)

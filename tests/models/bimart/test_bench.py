@@ -21,7 +21,7 @@ from hoidata.hands import load_embedded_hands
 from hoidata.metrics.optional_metrics import select_metrics
 from hoidata.objects.model import articulate
 from hoidata.settings import build_config
-from hoidata.store.windows import WindowProtocol
+from hoidata.store.annotated import WindowProtocol
 from models.bimart.scene import Scene
 from pipelines.stages.train import TrainParams
 from tests.builders.objects import hinged_box

@@ -9,10 +9,16 @@ import pytest
 
 from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets import Quarantined, RawTree
-from hoidata.datasets.arctic.adapter import ArcticAdapter
-from hoidata.datasets.arctic.files import Description, parse_description, parse_descriptions, parse_misc, parse_parts
+from hoidata.datasets.arctic.adapter import (
+    ArcticAdapter,
+    Description,
+    parse_description,
+    parse_descriptions,
+    parse_misc,
+    parse_parts,
+)
 from hoidata.errors import BadInput
-from hoidata.splits.leaks import find_leaks
+from hoidata.splits.definitions import find_leaks
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store_check.check import check_store
 from tests.builders import arctic as recording

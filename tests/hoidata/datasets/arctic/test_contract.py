@@ -25,7 +25,7 @@ from tests.builders.corruption import (
     removed,
     set_in,
 )
-from tests.hoidata.datasets.contract import AdapterContract, FileProblem
+from tests.hoidata.datasets.contract import AdapterContract, Problem
 
 HAND, OBJECT, CAMERA, BODY = (
     f"raw_seqs/s04/box_grab_01.{kind}.npy" for kind in ("mano", "object", "egocam.dist", "smplx")
@@ -97,70 +97,62 @@ class TestArctic(AdapterContract):
     }
 
     @staticmethod
-    def file_problems() -> Iterable[FileProblem]:
+    def file_problems() -> Iterable[Problem]:
         infinite = hand(lambda data: data["left"]["rot"].__setitem__((3, 2), -np.inf))
         twice = at(TEXT, lambda data: data + b"15-44 lift, both hands\n")
-        yield FileProblem("truncated file", HAND, at(HAND, cut_in_half), "pickle")
-        yield FileProblem("empty file", OBJECT, at(OBJECT, emptied), "NumPy file")
-        yield FileProblem("malicious pickle", HAND, hand(set_in("left", value=Command())), "not allowed")
-        yield FileProblem("NaN", OBJECT, at(OBJECT, in_array(number((3, 2), np.nan))), "finite")
-        yield FileProblem("infinity", HAND, infinite, "finite")
-        yield FileProblem("wrong columns", OBJECT, at(OBJECT, in_array(lambda array: array[:, :6])), "7 columns")
-        yield FileProblem(
-            "wrong dtype (words)", OBJECT, at(OBJECT, in_array(lambda array: array.astype("U4"))), "numbers"
-        )
-        yield FileProblem("missing object file", MESH, removed(MESH), "nothing there")
-        yield FileProblem("missing object motion", OBJECT, removed(OBJECT), "nothing there")
-        yield FileProblem("frame-count mismatch", HAND, at(OBJECT, in_array(lambda array: array[:-1])), "69 frames")
-        yield FileProblem("non-UTF-8 text", TEXT, at(TEXT, lambda data: b"\xff\xfe" + data), "UTF-8")
-        yield FileProblem("duplicate ids", "box_grab_01", twice, "twice")
-        yield FileProblem("symlink out of the root", HAND, linked_outside(HAND), "link that leaves")
-        yield FileProblem("zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces")
-        yield FileProblem("parts of another mesh", PARTS, holding(PARTS, "[1, 0]"), "8 zeros and ones")
-        yield FileProblem("nested JSON", PARTS, holding(PARTS, b"[" * 100_000), "JSON")
-        yield FileProblem("absurd size (header)", OBJECT, at(OBJECT, huge_npy), "bytes of data")
+        yield "truncated file", HAND, at(HAND, cut_in_half), "pickle"
+        yield "empty file", OBJECT, at(OBJECT, emptied), "NumPy file"
+        yield "malicious pickle", HAND, hand(set_in("left", value=Command())), "not allowed"
+        yield "NaN", OBJECT, at(OBJECT, in_array(number((3, 2), np.nan))), "finite"
+        yield "infinity", HAND, infinite, "finite"
+        yield "wrong columns", OBJECT, at(OBJECT, in_array(lambda array: array[:, :6])), "7 columns"
+        yield "wrong dtype (words)", OBJECT, at(OBJECT, in_array(lambda array: array.astype("U4"))), "numbers"
+        yield "missing object file", MESH, removed(MESH), "nothing there"
+        yield "missing object motion", OBJECT, removed(OBJECT), "nothing there"
+        yield "frame-count mismatch", HAND, at(OBJECT, in_array(lambda array: array[:-1])), "69 frames"
+        yield "non-UTF-8 text", TEXT, at(TEXT, lambda data: b"\xff\xfe" + data), "UTF-8"
+        yield "duplicate ids", "box_grab_01", twice, "twice"
+        yield "symlink out of the root", HAND, linked_outside(HAND), "link that leaves"
+        yield "zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces"
+        yield "parts of another mesh", PARTS, holding(PARTS, "[1, 0]"), "8 zeros and ones"
+        yield "nested JSON", PARTS, holding(PARTS, b"[" * 100_000), "JSON"
+        yield "absurd size (header)", OBJECT, at(OBJECT, huge_npy), "bytes of data"
 
     @staticmethod
-    def format_problems() -> Iterable[FileProblem]:
+    def format_problems() -> Iterable[Problem]:
         turns, shift = arctic.head()["R_k_cam_np"], arctic.head()["T_k_cam_np"]
         short = hand(lambda data: data["left"].update(trans=np.zeros((69, 3))))
         five_betas = hand(lambda data: data["left"].update(shape=np.zeros((5, 10))))
         nine_betas = hand(lambda data: data["right"].update(shape=np.zeros(9)))
         one_for_two = holding(TEXT, "1-40 open, left hand\n1-40 close, left hand\n")
-        yield FileProblem("a missing hand file", HAND, removed(HAND), "a file")
-        yield FileProblem("hands that are a list", HAND, boxed(HAND, [1, 2]), "dictionary")
-        yield FileProblem("a missing hand", HAND, hand(lambda data: data.pop("left")), "left")
-        yield FileProblem("hands of another number of frames", "left.trans", short, "70 frames")
-        yield FileProblem("betas of another number of frames", "left.shape", five_betas, "70 rows")
-        yield FileProblem("nine betas", "right.shape", nine_betas, "10 columns")
-        yield FileProblem("a frame too many", HAND, holding(OBJECT, npy_of(np.zeros((71, 7)))), "71 frames")
+        yield "a missing hand file", HAND, removed(HAND), "a file"
+        yield "hands that are a list", HAND, boxed(HAND, [1, 2]), "dictionary"
+        yield "a missing hand", HAND, hand(lambda data: data.pop("left")), "left"
+        yield "hands of another number of frames", "left.trans", short, "70 frames"
+        yield "betas of another number of frames", "left.shape", five_betas, "70 rows"
+        yield "nine betas", "right.shape", nine_betas, "10 columns"
+        yield "a frame too many", HAND, holding(OBJECT, npy_of(np.zeros((71, 7)))), "71 frames"
         for path, kind in ((OBJECT, "motion"), (CAMERA, "the camera")):
-            yield FileProblem(f"a command in {kind}", path, boxed(path, {"R_k_cam_np": Command()}), "not allowed")
-        yield FileProblem("no description", TEXT, removed(TEXT), "segments")
-        yield FileProblem(
-            "a range described twice", "arctic/s04/box_grab_01", one_for_two, "one line per range and hand"
-        )
-        yield FileProblem("a description beyond all bounds", TEXT, holding(TEXT, b"\n" * (17 << 20)), "at most")
-        yield FileProblem("parts that are not JSON", PARTS, holding(PARTS, "[1, 1,"), "JSON text")
-        yield FileProblem("parts that are no list", PARTS, holding(PARTS, '{"0": 1}'), "8 zeros and ones")
-        yield FileProblem("a part 2", PARTS, holding(PARTS, "[1, 1, 1, 1, 0, 0, 0, 2]"), "8 zeros and ones")
-        yield FileProblem("a mesh that is no text", MESH, holding(MESH, b"\xff\xfe\x00v"), "vertices")
-        yield FileProblem("a corner beyond all vertices", MESH, holding(MESH, NO_FACE_OBJ + b"f 1 2 900\n"), "corners")
-        yield FileProblem("a camera of 69 frames", "T_k_cam_np", camera(T_k_cam_np=shift[:69]), "70 frames")
-        yield FileProblem("a camera without rotation", "egocam", camera(R_k_cam_np=None), "R_k_cam_np")
-        yield FileProblem("a camera that mirrors", "R_k_cam_np", camera(R_k_cam_np=turns * (1, 1, -1)), "rotations")
-        yield FileProblem("a camera that grows", "R_k_cam_np", camera(R_k_cam_np=turns * 1.01), "rotations")
-        yield FileProblem("a camera of other matrices", "R_k_cam_np", camera(R_k_cam_np=np.zeros((70, 4, 4))), "3 x 3")
-        yield FileProblem("a camera of text", "R_k_cam_np", camera(R_k_cam_np=np.full((70, 3, 3), "x")), "numbers")
-        yield FileProblem("intrinsics of two rows", "intrinsics", camera(intrinsics=np.ones((2, 3))), "3 rows")
-        yield FileProblem("offsets that are not JSON", "misc.json", misc(b"{"), "JSON text")
-        yield FileProblem("offsets in a list", "misc.json", misc(b"[1]"), "JSON object")
-        yield FileProblem(
-            "a subject without offset", "misc.json: s04", misc(b'{"s04": {"gender": "male"}}'), "ioi_offset"
-        )
-        yield FileProblem(
-            "an offset of half a frame", "ioi_offset", misc(b'{"s04": {"ioi_offset": 0.5}}'), "whole number"
-        )
+            yield f"a command in {kind}", path, boxed(path, {"R_k_cam_np": Command()}), "not allowed"
+        yield "no description", TEXT, removed(TEXT), "segments"
+        yield "a range described twice", "arctic/s04/box_grab_01", one_for_two, "one line per range and hand"
+        yield "a description beyond all bounds", TEXT, holding(TEXT, b"\n" * (17 << 20)), "at most"
+        yield "parts that are not JSON", PARTS, holding(PARTS, "[1, 1,"), "JSON text"
+        yield "parts that are no list", PARTS, holding(PARTS, '{"0": 1}'), "8 zeros and ones"
+        yield "a part 2", PARTS, holding(PARTS, "[1, 1, 1, 1, 0, 0, 0, 2]"), "8 zeros and ones"
+        yield "a mesh that is no text", MESH, holding(MESH, b"\xff\xfe\x00v"), "vertices"
+        yield "a corner beyond all vertices", MESH, holding(MESH, NO_FACE_OBJ + b"f 1 2 900\n"), "corners"
+        yield "a camera of 69 frames", "T_k_cam_np", camera(T_k_cam_np=shift[:69]), "70 frames"
+        yield "a camera without rotation", "egocam", camera(R_k_cam_np=None), "R_k_cam_np"
+        yield "a camera that mirrors", "R_k_cam_np", camera(R_k_cam_np=turns * (1, 1, -1)), "rotations"
+        yield "a camera that grows", "R_k_cam_np", camera(R_k_cam_np=turns * 1.01), "rotations"
+        yield "a camera of other matrices", "R_k_cam_np", camera(R_k_cam_np=np.zeros((70, 4, 4))), "3 x 3"
+        yield "a camera of text", "R_k_cam_np", camera(R_k_cam_np=np.full((70, 3, 3), "x")), "numbers"
+        yield "intrinsics of two rows", "intrinsics", camera(intrinsics=np.ones((2, 3))), "3 rows"
+        yield "offsets that are not JSON", "misc.json", misc(b"{"), "JSON text"
+        yield "offsets in a list", "misc.json", misc(b"[1]"), "JSON object"
+        yield "a subject without offset", "misc.json: s04", misc(b'{"s04": {"gender": "male"}}'), "ioi_offset"
+        yield "an offset of half a frame", "ioi_offset", misc(b'{"s04": {"ioi_offset": 0.5}}'), "whole number"
 
 
 @pytest.mark.parametrize("change", ["body of 69 frames", "no body", "no jaw", "a command"])

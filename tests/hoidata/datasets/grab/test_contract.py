@@ -22,7 +22,7 @@ from tests.builders.corruption import (
     set_in,
     with_member,
 )
-from tests.hoidata.datasets.contract import AdapterContract, FileProblem
+from tests.hoidata.datasets.contract import AdapterContract, Problem
 
 FILE = "grab/s3/cubelarge_offhand_1.npz"
 MESH = "tools/object_meshes/contact_meshes/cubelarge.ply"
@@ -86,7 +86,7 @@ class TestGrab(AdapterContract):
     }
 
     @staticmethod
-    def file_problems() -> Iterable[FileProblem]:
+    def file_problems() -> Iterable[Problem]:
         zeros = np.zeros((61, 3), np.float32)
         bomb = npy_of(np.zeros(3))[:-24].replace(b"(3,), }  ", b"(200000000,), }")
         outside = set_in("object", "object_mesh", value="../../../../../../../../etc/passwd")
@@ -94,68 +94,50 @@ class TestGrab(AdapterContract):
         words = edited(set_in("object", "params", "transl", value=zeros.astype("U3")))
         wrong = edited(set_in("rhand", "params", "transl", value=np.zeros((61, 4))))
         short = edited(set_in("lhand", "params", "transl", value=zeros[:60]))
-        yield FileProblem("truncated file", FILE, at(FILE, cut_in_half), "whole .npz")
-        yield FileProblem("empty file", FILE, at(FILE, emptied), "whole .npz")
-        yield FileProblem("malicious pickle", FILE, edited(set_in("rhand", value=Command())), "not allowed")
-        yield FileProblem("malicious pickle deep inside", FILE, deep, "not allowed")
-        yield FileProblem("NaN", FILE, number("object", np.nan), "finite")
-        yield FileProblem("infinity", FILE, number("rhand", np.inf), "finite")
-        yield FileProblem("wrong columns", FILE, wrong, "3 columns")
-        yield FileProblem("wrong dtype (words)", FILE, words, "numbers")
-        yield FileProblem("missing object file", MESH, removed(MESH), "nothing there")
-        yield FileProblem("frame-count mismatch", FILE, short, "61 frames")
-        yield FileProblem("non-UTF-8 text", FILE, edited(set_in("motion_intent", value=b"\xff\xfe")), "text")
-        yield FileProblem(
-            "duplicate member", FILE, at(FILE, with_member("rhand.npy", npy_of(np.zeros(2)), again=True)), "once"
-        )
-        yield FileProblem("symlink out of the root", FILE, linked_outside(FILE), "link that leaves")
-        yield FileProblem("path out of the root inside the file", "passwd", edited(outside), "link that leaves")
-        yield FileProblem("zero-face mesh", MESH, holding(MESH, NO_FACE_PLY), "with faces")
-        yield FileProblem("absurd size (10^9 vertices)", MESH, holding(MESH, HUGE_PLY), "more than")
-        yield FileProblem(
-            "absurd size (header)", FILE, at(FILE, with_member("n_frames.npy", huge_npy(b""))), "bytes of data"
-        )
-        yield FileProblem(
-            "zip bomb", FILE, at(FILE, with_member("n_frames.npy", bomb + bytes(1_200_000_000))), "when unpacked"
-        )
+        yield "truncated file", FILE, at(FILE, cut_in_half), "whole .npz"
+        yield "empty file", FILE, at(FILE, emptied), "whole .npz"
+        yield "malicious pickle", FILE, edited(set_in("rhand", value=Command())), "not allowed"
+        yield "malicious pickle deep inside", FILE, deep, "not allowed"
+        yield "NaN", FILE, number("object", np.nan), "finite"
+        yield "infinity", FILE, number("rhand", np.inf), "finite"
+        yield "wrong columns", FILE, wrong, "3 columns"
+        yield "wrong dtype (words)", FILE, words, "numbers"
+        yield "missing object file", MESH, removed(MESH), "nothing there"
+        yield "frame-count mismatch", FILE, short, "61 frames"
+        yield "non-UTF-8 text", FILE, edited(set_in("motion_intent", value=b"\xff\xfe")), "text"
+        yield "duplicate member", FILE, at(FILE, with_member("rhand.npy", npy_of(np.zeros(2)), again=True)), "once"
+        yield "symlink out of the root", FILE, linked_outside(FILE), "link that leaves"
+        yield "path out of the root inside the file", "passwd", edited(outside), "link that leaves"
+        yield "zero-face mesh", MESH, holding(MESH, NO_FACE_PLY), "with faces"
+        yield "absurd size (10^9 vertices)", MESH, holding(MESH, HUGE_PLY), "more than"
+        yield "absurd size (header)", FILE, at(FILE, with_member("n_frames.npy", huge_npy(b""))), "bytes of data"
+        yield "zip bomb", FILE, at(FILE, with_member("n_frames.npy", bomb + bytes(1_200_000_000))), "when unpacked"
 
     @staticmethod
-    def format_problems() -> Iterable[FileProblem]:
+    def format_problems() -> Iterable[Problem]:
         third, ones = np.arange(grab.N_VERTICES) == 2, np.ones(SHAPE)
         hand = "tools/subject_meshes/male/s3_rhand.ply"
         for member in ("contact", "table", "framerate"):
             runs = edited(set_in(member, value={"params": Command(), "object": Command()}), grab.with_table)
-            yield FileProblem(f"a command in {member}", FILE, runs, "not allowed")
+            yield f"a command in {member}", FILE, runs, "not allowed"
         no_turn = edited(lambda data: data["object"]["params"].pop("global_orient"))
-        yield FileProblem("no rotation", "object", no_turn, "global_orient")
-        yield FileProblem(
-            "no contact", "contact.object", contact(np.zeros(SHAPE, np.int8)), "contact in at least one frame"
-        )
-        yield FileProblem("contact of another mesh", "contact.object", contact(np.ones((61, 9), np.int8)), "(61, 8)")
-        yield FileProblem(
-            "a frame rate of 100", "framerate", edited(set_in("framerate", value=100.0)), "multiple of 30"
-        )
-        yield FileProblem(
-            "an endless frame rate", "framerate", edited(set_in("framerate", value=np.inf)), "whole number"
-        )
-        yield FileProblem("an unreadable mesh", MESH, holding(MESH, "ply\nnothing"), "mesh")
-        yield FileProblem("a mesh header that is no text", MESH, holding(MESH, b"ply\nformat ascii \xff\xfe\n"), "mesh")
-        yield FileProblem(
-            "10^15 frames", "contact.object", edited(set_in("n_frames", value=10**15)), "(1000000000000000, 8)"
-        )
-        yield FileProblem("frames of another number", "contact.object", edited(set_in("n_frames", value=60)), "(60, 8)")
-        yield FileProblem("half a frame", "n_frames", edited(set_in("n_frames", value=61.5)), "whole number")
-        yield FileProblem("no contact entry", FILE, edited(lambda data: data.pop("contact")), "contact")
-        yield FileProblem("contact that is no dict", "contact", edited(set_in("contact", value=[1])), "dict")
-        yield FileProblem("contact of text", "contact.object", contact(np.full(SHAPE, "x")), "numbers")
-        yield FileProblem(
-            "contact of halves", "contact.object", contact(np.where(third, 0.5, 0) * ones), "whole numbers"
-        )
-        yield FileProblem(
-            "contact of NaN", "contact.object", contact(np.where(third, np.nan, 22) * ones), "whole numbers"
-        )
-        yield FileProblem("contact beyond all labels", "contact.object", contact(np.full(SHAPE, 300)), "up to 255")
-        yield FileProblem("components without columns", "lhand.hand_pose", components(0), "24 columns")
-        yield FileProblem("more components than the model has", "lhand.hand_pose", components(46), "24 columns")
-        yield FileProblem("a table of 60 frames", "table", short_table, "61 frames")
-        yield FileProblem("a missing hand mesh", hand, removed(hand), "a file")
+        yield "no rotation", "object", no_turn, "global_orient"
+        yield "no contact", "contact.object", contact(np.zeros(SHAPE, np.int8)), "contact in at least one frame"
+        yield "contact of another mesh", "contact.object", contact(np.ones((61, 9), np.int8)), "(61, 8)"
+        yield "a frame rate of 100", "framerate", edited(set_in("framerate", value=100.0)), "multiple of 30"
+        yield "an endless frame rate", "framerate", edited(set_in("framerate", value=np.inf)), "whole number"
+        yield "an unreadable mesh", MESH, holding(MESH, "ply\nnothing"), "mesh"
+        yield "a mesh header that is no text", MESH, holding(MESH, b"ply\nformat ascii \xff\xfe\n"), "mesh"
+        yield "10^15 frames", "contact.object", edited(set_in("n_frames", value=10**15)), "(1000000000000000, 8)"
+        yield "frames of another number", "contact.object", edited(set_in("n_frames", value=60)), "(60, 8)"
+        yield "half a frame", "n_frames", edited(set_in("n_frames", value=61.5)), "whole number"
+        yield "no contact entry", FILE, edited(lambda data: data.pop("contact")), "contact"
+        yield "contact that is no dict", "contact", edited(set_in("contact", value=[1])), "dict"
+        yield "contact of text", "contact.object", contact(np.full(SHAPE, "x")), "numbers"
+        yield "contact of halves", "contact.object", contact(np.where(third, 0.5, 0) * ones), "whole numbers"
+        yield "contact of NaN", "contact.object", contact(np.where(third, np.nan, 22) * ones), "whole numbers"
+        yield "contact beyond all labels", "contact.object", contact(np.full(SHAPE, 300)), "up to 255"
+        yield "components without columns", "lhand.hand_pose", components(0), "24 columns"
+        yield "more components than the model has", "lhand.hand_pose", components(46), "24 columns"
+        yield "a table of 60 frames", "table", short_table, "61 frames"
+        yield "a missing hand mesh", hand, removed(hand), "a file"

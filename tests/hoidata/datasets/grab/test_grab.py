@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hoidata.datasets.grab import words as grab_words
-from hoidata.datasets.grab.adapter import GrabAdapter, read_contact
-from hoidata.datasets.grab.words import object_words
+from hoidata.datasets.grab import adapter as grab_words
+from hoidata.datasets.grab.adapter import GrabAdapter, object_words, read_contact
 from hoidata.errors import BadInput
 from tests.builders import grab as recording
 

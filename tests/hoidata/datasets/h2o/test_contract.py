@@ -21,7 +21,7 @@ from tests.builders.corruption import (
     replaced,
     without_folder,
 )
-from tests.hoidata.datasets.contract import AdapterContract, FileProblem
+from tests.hoidata.datasets.contract import AdapterContract, Problem
 
 FOLDER = "subject2/k1/3/cam4"
 CAMERA, HAND, POSE, LABEL = (
@@ -63,27 +63,27 @@ class TestH2O(AdapterContract):
     }
 
     @staticmethod
-    def file_problems() -> Iterable[FileProblem]:
+    def file_problems() -> Iterable[Problem]:
         last = f"{FOLDER}/hand_pose_mano/000026.txt"
-        yield FileProblem("truncated file", HAND, at(HAND, cut_in_half), "124 numbers")
-        yield FileProblem("empty file", CAMERA, at(CAMERA, emptied), "16 numbers")
-        yield FileProblem("malicious pickle", HAND, at(HAND, malicious), "124 numbers")
-        yield FileProblem("NaN", POSE, at(POSE, replaced(b"0.45", b"nan")), "finite")
-        yield FileProblem("infinity", HAND, at(HAND, replaced(b"1.1", b"inf")), "finite")
-        yield FileProblem("wrong columns", HAND, at(HAND, lambda data: data + b" 5"), "got 125")
-        yield FileProblem("wrong dtype (words)", POSE, at(POSE, replaced(b"0.45", b"near")), "17 numbers")
-        yield FileProblem("missing camera file", CAMERA, removed(CAMERA), "nothing there")
-        yield FileProblem("missing object file", MESH, removed(MESH), "object's mesh")
-        yield FileProblem("frame-count mismatch", last, removed(last), "one file for each of 27 frames")
-        yield FileProblem("non-UTF-8 text", LABEL, holding(LABEL, b"\xff\xfe2\x006\x00"), "1 numbers")
-        yield FileProblem("symlink out of the root", CAMERA, linked_outside(CAMERA), "link that leaves")
-        yield FileProblem("zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces")
-        yield FileProblem("mesh without area", MESH, holding(MESH, FLAT_OBJ), "faces with area")
-        yield FileProblem("absurd size (frame file)", HAND, at(HAND, lambda data: data + b" 0" * (1 << 20)), "at most")
-        yield FileProblem("absurd size (corner 10^9)", MESH, holding(MESH, FAR_CORNER_OBJ), "face corners")
+        yield "truncated file", HAND, at(HAND, cut_in_half), "124 numbers"
+        yield "empty file", CAMERA, at(CAMERA, emptied), "16 numbers"
+        yield "malicious pickle", HAND, at(HAND, malicious), "124 numbers"
+        yield "NaN", POSE, at(POSE, replaced(b"0.45", b"nan")), "finite"
+        yield "infinity", HAND, at(HAND, replaced(b"1.1", b"inf")), "finite"
+        yield "wrong columns", HAND, at(HAND, lambda data: data + b" 5"), "got 125"
+        yield "wrong dtype (words)", POSE, at(POSE, replaced(b"0.45", b"near")), "17 numbers"
+        yield "missing camera file", CAMERA, removed(CAMERA), "nothing there"
+        yield "missing object file", MESH, removed(MESH), "object's mesh"
+        yield "frame-count mismatch", last, removed(last), "one file for each of 27 frames"
+        yield "non-UTF-8 text", LABEL, holding(LABEL, b"\xff\xfe2\x006\x00"), "1 numbers"
+        yield "symlink out of the root", CAMERA, linked_outside(CAMERA), "link that leaves"
+        yield "zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces"
+        yield "mesh without area", MESH, holding(MESH, FLAT_OBJ), "faces with area"
+        yield "absurd size (frame file)", HAND, at(HAND, lambda data: data + b" 0" * (1 << 20)), "at most"
+        yield "absurd size (corner 10^9)", MESH, holding(MESH, FAR_CORNER_OBJ), "face corners"
 
     @staticmethod
-    def format_problems() -> Iterable[FileProblem]:
+    def format_problems() -> Iterable[Problem]:
         intrinsics, beyond = f"{FOLDER}/cam_intrinsics.txt", f"{FOLDER}/cam_pose/000027.txt"
         mirror = [7, *(h2o.object_in_camera(10) @ np.diag([1, 1, -1, 1])).ravel()]
         first_two = [numbers(f"{FOLDER}/obj_pose_rt/00000{frame}.txt", np.zeros(17)) for frame in (0, 1)]
@@ -91,24 +91,22 @@ class TestH2O(AdapterContract):
         kinds = ("cam_pose", "hand_pose_mano", "obj_pose_rt", "action_label")
         gap = one_after_the_other(*(removed(f"{FOLDER}/{kind}/000010.txt") for kind in kinds))
         far = b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
-        yield FileProblem("a frame that no folder has", CAMERA, gap, "each of 27 frames")
-        yield FileProblem("a frame too many", "000027", numbers(beyond, h2o.camera(27)), "each of 28 frames")
-        yield FileProblem("too many columns", POSE, at(POSE, lambda data: data + b" 1.0"), "17")
-        yield FileProblem("infinity in a pose", POSE, numbers(POSE, [1e308] * 16 + [np.inf]), "finite")
-        yield FileProblem("an empty first line", CAMERA, at(CAMERA, lambda data: b"\n" + data), "16 numbers, got 0")
-        yield FileProblem("a binary file", HAND, holding(HAND, bytes(range(256))), "124 numbers")
-        yield FileProblem("JSON", LABEL, holding(LABEL, "[26]"), "1 numbers")
-        yield FileProblem("a label that is no whole number", LABEL, holding(LABEL, "26.5"), "0 to 36")
-        yield FileProblem("an unknown label", LABEL, holding(LABEL, "37"), "0 to 36")
-        yield FileProblem("an unknown object", POSE, numbers(POSE, [9, *np.eye(4).ravel()]), "0 to 8")
-        yield FileProblem("broken intrinsics", intrinsics, holding(intrinsics, "636.6 636.3"), "6 numbers, got 2")
-        yield FileProblem("a matrix that is no rotation", CAMERA, numbers(CAMERA, [0.5] * 16), "rotation")
-        yield FileProblem("a matrix by columns", CAMERA, numbers(CAMERA, h2o.camera(10).T), "row 0 0 0 1")
-        yield FileProblem("a mirror", POSE, numbers(POSE, mirror), "a mirror")
-        yield FileProblem("a bad pose behind frames without object", POSE, behind, "rotation")
+        yield "a frame that no folder has", CAMERA, gap, "each of 27 frames"
+        yield "a frame too many", "000027", numbers(beyond, h2o.camera(27)), "each of 28 frames"
+        yield "too many columns", POSE, at(POSE, lambda data: data + b" 1.0"), "17"
+        yield "infinity in a pose", POSE, numbers(POSE, [1e308] * 16 + [np.inf]), "finite"
+        yield "an empty first line", CAMERA, at(CAMERA, lambda data: b"\n" + data), "16 numbers, got 0"
+        yield "a binary file", HAND, holding(HAND, bytes(range(256))), "124 numbers"
+        yield "JSON", LABEL, holding(LABEL, "[26]"), "1 numbers"
+        yield "a label that is no whole number", LABEL, holding(LABEL, "26.5"), "0 to 36"
+        yield "an unknown label", LABEL, holding(LABEL, "37"), "0 to 36"
+        yield "an unknown object", POSE, numbers(POSE, [9, *np.eye(4).ravel()]), "0 to 8"
+        yield "broken intrinsics", intrinsics, holding(intrinsics, "636.6 636.3"), "6 numbers, got 2"
+        yield "a matrix that is no rotation", CAMERA, numbers(CAMERA, [0.5] * 16), "rotation"
+        yield "a matrix by columns", CAMERA, numbers(CAMERA, h2o.camera(10).T), "row 0 0 0 1"
+        yield "a mirror", POSE, numbers(POSE, mirror), "a mirror"
+        yield "a bad pose behind frames without object", POSE, behind, "rotation"
         for kind in kinds[:3]:
-            yield FileProblem(
-                f"no {kind}", f"cam4/{kind}", without_folder(f"{FOLDER}/{kind}"), "a folder of NNNNNN.txt files"
-            )
-        yield FileProblem("an empty mesh", MESH, at(MESH, emptied), "vertices")
-        yield FileProblem("a mesh with NaN", MESH, holding(MESH, far), "finite")
+            yield f"no {kind}", f"cam4/{kind}", without_folder(f"{FOLDER}/{kind}"), "a folder of NNNNNN.txt files"
+        yield "an empty mesh", MESH, at(MESH, emptied), "vertices"
+        yield "a mesh with NaN", MESH, holding(MESH, far), "finite"

@@ -22,7 +22,7 @@ from tests.builders.corruption import (
     replaced,
 )
 from tests.builders.hoi4d import ANNOTATIONS, MODELS, SAFE, pickled
-from tests.hoidata.datasets.contract import AdapterContract, FileProblem
+from tests.hoidata.datasets.contract import AdapterContract, Problem
 
 HAND = f"handpose/refinehandpose_right/{SAFE}/5.pickle"
 POSE, CAMERA = f"{ANNOTATIONS}/{SAFE}/objpose/5.json", f"{ANNOTATIONS}/{SAFE}/3Dseg/output.log"
@@ -79,59 +79,41 @@ class TestHoi4d(AdapterContract):
     }
 
     @staticmethod
-    def file_problems() -> Iterable[FileProblem]:
-        yield FileProblem("truncated file", POSE, at(POSE, cut_in_half), "JSON")
-        yield FileProblem("empty file", EVENTS, at(EVENTS, emptied), "an empty file")
-        yield FileProblem(
-            "malicious pickle", HAND, holding(HAND, pickle.dumps({"poseCoeff": Command()})), "not allowed"
-        )
-        yield FileProblem("NaN", POSE, at(POSE, replaced(b'"x": ', b'"x": NaN, "a": ')), "JSON")
-        yield FileProblem("NaN in a hand", HAND, hand(trans=[np.nan, 0, 0]), "finite")
-        yield FileProblem("infinity", CAMERA, at(CAMERA, replaced(b"0.0 0.0 0.0 1.0", b"0.0 0.0 0.0 inf")), "finite")
-        yield FileProblem("wrong columns", HAND, hand(poseCoeff=np.zeros(49)), "48 columns")
-        yield FileProblem("wrong dtype (words)", POSE, first(lambda part: part["center"].update(x="words")), "numbers")
-        yield FileProblem("missing object file", MESH, removed(MESH), "nothing there")
-        yield FileProblem(
-            "frame-count mismatch", "objpose", at(CAMERA, lambda data: _lines(data, 95)), "as output.log has"
-        )
-        yield FileProblem("symlink out of the root", POSE, linked_outside(POSE), "link that leaves")
-        yield FileProblem("zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces")
-        yield FileProblem("absurd size (face)", MESH, holding(MESH, FAR_CORNER_OBJ), "face corners")
-        yield FileProblem(
-            "absurd size (hand)", HAND, holding(HAND, b"\x80\x02" + bytes(100_000)), "at most 65536 bytes"
-        )
+    def file_problems() -> Iterable[Problem]:
+        yield "truncated file", POSE, at(POSE, cut_in_half), "JSON"
+        yield "empty file", EVENTS, at(EVENTS, emptied), "an empty file"
+        yield "malicious pickle", HAND, holding(HAND, pickle.dumps({"poseCoeff": Command()})), "not allowed"
+        yield "NaN", POSE, at(POSE, replaced(b'"x": ', b'"x": NaN, "a": ')), "JSON"
+        yield "NaN in a hand", HAND, hand(trans=[np.nan, 0, 0]), "finite"
+        yield "infinity", CAMERA, at(CAMERA, replaced(b"0.0 0.0 0.0 1.0", b"0.0 0.0 0.0 inf")), "finite"
+        yield "wrong columns", HAND, hand(poseCoeff=np.zeros(49)), "48 columns"
+        yield "wrong dtype (words)", POSE, first(lambda part: part["center"].update(x="words")), "numbers"
+        yield "missing object file", MESH, removed(MESH), "nothing there"
+        yield "frame-count mismatch", "objpose", at(CAMERA, lambda data: _lines(data, 95)), "as output.log has"
+        yield "symlink out of the root", POSE, linked_outside(POSE), "link that leaves"
+        yield "zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces"
+        yield "absurd size (face)", MESH, holding(MESH, FAR_CORNER_OBJ), "face corners"
+        yield "absurd size (hand)", HAND, holding(HAND, b"\x80\x02" + bytes(100_000)), "at most 65536 bytes"
 
     @staticmethod
-    def format_problems() -> Iterable[FileProblem]:
-        yield FileProblem("no trajectory", CAMERA, removed(CAMERA), "expected a file")
-        yield FileProblem("a matrix by columns", "output.log", at(CAMERA, _transposed), "a rotation and a shift")
-        yield FileProblem("a line too few", CAMERA, at(CAMERA, lambda data: _lines(data, 99)), "five lines per frame")
-        yield FileProblem("no events", EVENTS, removed(EVENTS), "expected a file")
-        yield FileProblem(
-            "events of no time", EVENTS, edited(EVENTS, lambda value: value["events"][0].pop("endTime")), "endTime"
-        )
-        yield FileProblem(
-            "another clock", EVENTS, edited(EVENTS, lambda value: value["info"].update(duration="long")), "seconds"
-        )
-        yield FileProblem("an object that is a list", POSE, holding(POSE, b"[1]"), "a dictionary with")
-        yield FileProblem(
-            "no objects", POSE, edited(POSE, lambda value: value["dataList"].clear()), "at least one object"
-        )
-        yield FileProblem("no centre", POSE, first(lambda part: part.pop("center")), "'center'")
-        yield FileProblem("a length of 0", POSE, first(lambda part: part["dimensions"].update(height=0)), "above 0")
-        yield FileProblem(
-            "other parts", POSE, first(lambda part: part.update(label="lid")), "the parts Safebox, Safedoor"
-        )
-        yield FileProblem(
-            "a part twice", POSE, edited(POSE, lambda v: v["dataList"].append(v["dataList"][0])), "of its own"
-        )
-        yield FileProblem("deep JSON", POSE, holding(POSE, b"[" * 100_000), "JSON")
-        yield FileProblem("code", POSE, holding(POSE, b"__import__('os').system('touch canary')"), "JSON")
-        yield FileProblem("no hinge", HINGE, edited(HINGE, lambda nodes: nodes.pop()), "one base and one part")
-        yield FileProblem(
-            "no mesh of a part", HINGE, edited(TREE, lambda tree: tree[0]["children"].pop()), "one mesh for each"
-        )
-        yield FileProblem("an axis of no length", HINGE, edited(HINGE, _without_axis), "a direction")
+    def format_problems() -> Iterable[Problem]:
+        yield "no trajectory", CAMERA, removed(CAMERA), "expected a file"
+        yield "a matrix by columns", "output.log", at(CAMERA, _transposed), "a rotation and a shift"
+        yield "a line too few", CAMERA, at(CAMERA, lambda data: _lines(data, 99)), "five lines per frame"
+        yield "no events", EVENTS, removed(EVENTS), "expected a file"
+        yield "events of no time", EVENTS, edited(EVENTS, lambda value: value["events"][0].pop("endTime")), "endTime"
+        yield "another clock", EVENTS, edited(EVENTS, lambda value: value["info"].update(duration="long")), "seconds"
+        yield "an object that is a list", POSE, holding(POSE, b"[1]"), "a dictionary with"
+        yield "no objects", POSE, edited(POSE, lambda value: value["dataList"].clear()), "at least one object"
+        yield "no centre", POSE, first(lambda part: part.pop("center")), "'center'"
+        yield "a length of 0", POSE, first(lambda part: part["dimensions"].update(height=0)), "above 0"
+        yield "other parts", POSE, first(lambda part: part.update(label="lid")), "the parts Safebox, Safedoor"
+        yield "a part twice", POSE, edited(POSE, lambda v: v["dataList"].append(v["dataList"][0])), "of its own"
+        yield "deep JSON", POSE, holding(POSE, b"[" * 100_000), "JSON"
+        yield "code", POSE, holding(POSE, b"__import__('os').system('touch canary')"), "JSON"
+        yield "no hinge", HINGE, edited(HINGE, lambda nodes: nodes.pop()), "one base and one part"
+        yield "no mesh of a part", HINGE, edited(TREE, lambda tree: tree[0]["children"].pop()), "one mesh for each"
+        yield "an axis of no length", HINGE, edited(HINGE, _without_axis), "a direction"
 
 
 def _without_axis(nodes: list) -> None:

@@ -14,8 +14,15 @@ from hoidata.clips.validation import check_clip
 from hoidata.datasets import RawTree
 from hoidata.datasets.hinge import fit_hinge
 from hoidata.datasets.hoi4d.adapter import Hoi4dAdapter
-from hoidata.datasets.hoi4d.files import EVENTS, action_events, frame_numbers, hinge_joint
-from hoidata.datasets.hoi4d.parts import match_boxes, upsample_rotvecs, upsample_values
+from hoidata.datasets.hoi4d.files import (
+    EVENTS,
+    action_events,
+    frame_numbers,
+    hinge_joint,
+    match_boxes,
+    upsample_rotvecs,
+    upsample_values,
+)
 from hoidata.errors import BadInput
 from hoidata.metrics.bimart import con_everywhere_corrected
 from hoidata.objects.model import Hinge

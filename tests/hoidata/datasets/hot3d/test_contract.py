@@ -19,7 +19,7 @@ from tests.builders.corruption import (
     set_in,
 )
 from tests.builders.hot3d import ARIA, MUG, OBJECT_HEAD, UMETRACK_FILE
-from tests.hoidata.datasets.contract import AdapterContract, FileProblem
+from tests.hoidata.datasets.contract import AdapterContract, Problem
 
 HAND, OBJECT, META = f"{ARIA}/mano_hand_pose_trajectory.jsonl", f"{ARIA}/dynamic_objects.csv", f"{ARIA}/metadata.json"
 QA, MESH, NAMES = f"{ARIA}/masks/mask_qa_pass.csv", f"assets/{MUG}.glb", "assets/instance.json"
@@ -102,77 +102,59 @@ class TestHot3d(AdapterContract):
     }
 
     @staticmethod
-    def file_problems() -> Iterable[FileProblem]:
+    def file_problems() -> Iterable[Problem]:
         fat = b'{"timestamp_ns": 1, "hand_poses": [' + b"[]," * 30_000 + b"[]]}\n"
-        yield FileProblem("truncated file", HAND, at(HAND, cut_in_half), "JSON text")
-        yield FileProblem("empty file", OBJECT, at(OBJECT, emptied), "the columns object_uid")
-        yield FileProblem("malicious pickle", HAND, at(HAND, malicious), "JSON text")
-        yield FileProblem("NaN", HAND, at(HAND, replaced(b'"betas": [', b'"betas": [NaN, ')), "JSON text")
-        yield FileProblem("infinity", OBJECT, cell("1e400", 2), "finite")
-        yield FileProblem("wrong columns", HAND, line(set_in(*RIGHT, "pose", value=[0.1] * 45)), "15 numbers, got 45")
-        yield FileProblem("wrong dtype (words)", HAND, line(set_in(*RIGHT, "pose", value="words")), "15 numbers")
-        yield FileProblem("missing object file", MESH, removed(MESH), "nothing there")
-        yield FileProblem("missing object motion", OBJECT, removed(OBJECT), "nothing there")
-        yield FileProblem("non-UTF-8 text", OBJECT, cell("\xff", 0), "an object id of digits")
-        yield FileProblem("symlink out of the root", HAND, linked_outside(HAND), "link that leaves")
-        yield FileProblem("zero-face mesh", MESH, holding(MESH, hot3d.glb(hot3d.box(1), faces=())), "with faces")
-        yield FileProblem("absurd size (line)", HAND, holding(HAND, fat), "a line of at most")
-        yield FileProblem(
-            "absurd size (header)", MESH, at(MESH, replaced(b'"count": 8, "min"', b'"count":9e5,"min"')), "corners in"
-        )
-        yield FileProblem("duplicate ids", OBJECT, at(OBJECT, lambda data: data + data.splitlines()[1]), "twice")
+        yield "truncated file", HAND, at(HAND, cut_in_half), "JSON text"
+        yield "empty file", OBJECT, at(OBJECT, emptied), "the columns object_uid"
+        yield "malicious pickle", HAND, at(HAND, malicious), "JSON text"
+        yield "NaN", HAND, at(HAND, replaced(b'"betas": [', b'"betas": [NaN, ')), "JSON text"
+        yield "infinity", OBJECT, cell("1e400", 2), "finite"
+        yield "wrong columns", HAND, line(set_in(*RIGHT, "pose", value=[0.1] * 45)), "15 numbers, got 45"
+        yield "wrong dtype (words)", HAND, line(set_in(*RIGHT, "pose", value="words")), "15 numbers"
+        yield "missing object file", MESH, removed(MESH), "nothing there"
+        yield "missing object motion", OBJECT, removed(OBJECT), "nothing there"
+        yield "non-UTF-8 text", OBJECT, cell("\xff", 0), "an object id of digits"
+        yield "symlink out of the root", HAND, linked_outside(HAND), "link that leaves"
+        yield "zero-face mesh", MESH, holding(MESH, hot3d.glb(hot3d.box(1), faces=())), "with faces"
+        yield "absurd size (line)", HAND, holding(HAND, fat), "a line of at most"
+        yield "absurd size (header)", MESH, at(MESH, replaced(b'"count": 8, "min"', b'"count":9e5,"min"')), "corners in"
+        yield "duplicate ids", OBJECT, at(OBJECT, lambda data: data + data.splitlines()[1]), "twice"
 
     @staticmethod
-    def format_problems() -> Iterable[FileProblem]:
+    def format_problems() -> Iterable[Problem]:
         quaternion = line(set_in(*RIGHT, "wrist_xform", "q_wxyz", value=[2.0, 0.0, 0.0, 0.0]))
         wide = hot3d.packed(b'{"asset": {"version": "2.0"}}', b"")
         withheld = one_after_the_other(removed(HAND), removed(PROFILE))
-        yield FileProblem("no hands", HAND, withheld, "nothing to do: of some participants")
-        yield FileProblem(
-            "hands of nobody", HAND, holding(HAND, b'{"timestamp_ns": 5, "hand_poses": {}}\n'), "got none"
-        )
-        yield FileProblem(
-            "a third hand", ":3: hand_poses", line(lambda data: data["hand_poses"].update({"2": 1})), "hands 0"
-        )
-        yield FileProblem("a hand that is a list", ":3: hand 1", line(set_in(*RIGHT, value=[])), "a dictionary")
-        yield FileProblem("no betas", ":3: hand 1", line(lambda data: data["hand_poses"]["1"].pop("betas")), "'betas'")
-        yield FileProblem(
-            "true for a number", "t_xyz", line(set_in(*RIGHT, "wrist_xform", "t_xyz", value=[True, 1, 1])), "3 nu"
-        )
-        yield FileProblem(
-            "a time in seconds", "timestamp_ns", line(set_in("timestamp_ns", value=1.5)), "nanoseconds, got 1.5"
-        )
-        yield FileProblem("a quaternion of length 2", "right hand", quaternion, "one of length 2")
-        yield FileProblem(
-            "a time twice", "left hand", at(HAND, lambda data: data + data.splitlines()[0]), "each time once"
-        )
-        yield FileProblem(
-            "times of 120 Hz", "times", line(set_in("timestamp_ns", value=56752117188860)), "1/30 s apart"
-        )
-        yield FileProblem("an empty line", ":1", at(HAND, lambda data: b"\n" + data), "JSON text")
-        yield FileProblem("a missing column", OBJECT, holding(OBJECT, OBJECT_HEAD.replace("q_wo_w,", "")), "q_wo_w")
-        yield FileProblem("a place beyond the town", OBJECT, cell("1e200", 2), "numbers up to 1000")
-        yield FileProblem("no rows", OBJECT, holding(OBJECT, OBJECT_HEAD + "\n"), "poses of an object")
-        yield FileProblem("too many cells", f"{OBJECT}:3", cell("1,2", 2), "9 cells")
-        yield FileProblem("digits of another script", f"{OBJECT}:3", cell("٣", 2), "numbers")
-        yield FileProblem("an underscore in a number", f"{OBJECT}:3", cell("1_0", 2), "numbers")
-        yield FileProblem("a time in words", f"{OBJECT}:3", cell("now", 1), "nanoseconds")
-        yield FileProblem("an unknown object", NAMES, edited(NAMES, lambda data: data.pop(MUG)), f"the object {MUG}")
-        yield FileProblem(
-            "a name with a path", MUG, edited(NAMES, set_in(MUG, "instance_name", value="../mug")), "lower-case"
-        )
-        yield FileProblem("objects as a list", NAMES, holding(NAMES, b"[1]"), "a dictionary of objects")
-        yield FileProblem("another headset", META, edited(META, set_in("headset", value="Quest4")), "Aria or Quest3")
-        yield FileProblem("a mask of maybe", f"{QA}:3", cell("maybe", 2, QA), "True or False")
-        yield FileProblem("a scene without mesh", MESH, holding(MESH, wide), "with vertices")
-        yield FileProblem("nobody moves anything", ARIA, at(OBJECT, _far_away), "none in any frame")
-        yield FileProblem("no profile", PROFILE, with_umetrack_alone(removed(PROFILE)), "expected a file")
-        yield FileProblem("a profile of nobody", PROFILE, with_umetrack_alone(holding(PROFILE, b"{}")), "'hand_model'")
-        yield FileProblem("a bone 17", PROFILE, with_umetrack_alone(edited(PROFILE, _bone(17))), "bones 0 to 16")
-        yield FileProblem("half a bone", PROFILE, with_umetrack_alone(edited(PROFILE, _bone(1.5))), "bones 0 to 16")
-        yield FileProblem(
-            "an axis of length 2", PROFILE, with_umetrack_alone(edited(PROFILE, _long_axis)), "axes of length 1"
-        )
+        yield "no hands", HAND, withheld, "nothing to do: of some participants"
+        yield "hands of nobody", HAND, holding(HAND, b'{"timestamp_ns": 5, "hand_poses": {}}\n'), "got none"
+        yield "a third hand", ":3: hand_poses", line(lambda data: data["hand_poses"].update({"2": 1})), "hands 0"
+        yield "a hand that is a list", ":3: hand 1", line(set_in(*RIGHT, value=[])), "a dictionary"
+        yield "no betas", ":3: hand 1", line(lambda data: data["hand_poses"]["1"].pop("betas")), "'betas'"
+        yield "true for a number", "t_xyz", line(set_in(*RIGHT, "wrist_xform", "t_xyz", value=[True, 1, 1])), "3 nu"
+        yield "a time in seconds", "timestamp_ns", line(set_in("timestamp_ns", value=1.5)), "nanoseconds, got 1.5"
+        yield "a quaternion of length 2", "right hand", quaternion, "one of length 2"
+        yield "a time twice", "left hand", at(HAND, lambda data: data + data.splitlines()[0]), "each time once"
+        yield "times of 120 Hz", "times", line(set_in("timestamp_ns", value=56752117188860)), "1/30 s apart"
+        yield "an empty line", ":1", at(HAND, lambda data: b"\n" + data), "JSON text"
+        yield "a missing column", OBJECT, holding(OBJECT, OBJECT_HEAD.replace("q_wo_w,", "")), "q_wo_w"
+        yield "a place beyond the town", OBJECT, cell("1e200", 2), "numbers up to 1000"
+        yield "no rows", OBJECT, holding(OBJECT, OBJECT_HEAD + "\n"), "poses of an object"
+        yield "too many cells", f"{OBJECT}:3", cell("1,2", 2), "9 cells"
+        yield "digits of another script", f"{OBJECT}:3", cell("٣", 2), "numbers"
+        yield "an underscore in a number", f"{OBJECT}:3", cell("1_0", 2), "numbers"
+        yield "a time in words", f"{OBJECT}:3", cell("now", 1), "nanoseconds"
+        yield "an unknown object", NAMES, edited(NAMES, lambda data: data.pop(MUG)), f"the object {MUG}"
+        yield "a name with a path", MUG, edited(NAMES, set_in(MUG, "instance_name", value="../mug")), "lower-case"
+        yield "objects as a list", NAMES, holding(NAMES, b"[1]"), "a dictionary of objects"
+        yield "another headset", META, edited(META, set_in("headset", value="Quest4")), "Aria or Quest3"
+        yield "a mask of maybe", f"{QA}:3", cell("maybe", 2, QA), "True or False"
+        yield "a scene without mesh", MESH, holding(MESH, wide), "with vertices"
+        yield "nobody moves anything", ARIA, at(OBJECT, _far_away), "none in any frame"
+        yield "no profile", PROFILE, with_umetrack_alone(removed(PROFILE)), "expected a file"
+        yield "a profile of nobody", PROFILE, with_umetrack_alone(holding(PROFILE, b"{}")), "'hand_model'"
+        yield "a bone 17", PROFILE, with_umetrack_alone(edited(PROFILE, _bone(17))), "bones 0 to 16"
+        yield "half a bone", PROFILE, with_umetrack_alone(edited(PROFILE, _bone(1.5))), "bones 0 to 16"
+        yield "an axis of length 2", PROFILE, with_umetrack_alone(edited(PROFILE, _long_axis)), "axes of length 1"
 
 
 def _bone(value: float) -> Callable[[dict], None]:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from hoidata.clips.clip import Clip
 from hoidata.clips.hand_parameters import hands_for
 from hoidata.datasets import RawTree, SequenceKey
-from hoidata.datasets.hot3d import files, sources
+from hoidata.datasets.hot3d import files
 from hoidata.datasets.hot3d.adapter import Hot3dAdapter
 from hoidata.hands import load_embedded_hands
 from tests.builders import hot3d
@@ -205,8 +205,8 @@ def umetrack_joints(side: str) -> np.ndarray:
     pose = {"wrist_xform": wrist, "joint_angles": [*ANGLES, 0.7, -0.7], "hand_confidence": 1.0}
     line = {"timestamp_ns": 1, "hand_poses": {str(SIDES.index(side)): pose}}
     (poses,) = files.hand_poses(json.dumps(line).encode(), "u.jsonl", "umetrack").values()
-    profile = sources.parse_profile(json.dumps(hot3d.profile()).encode(), "profile.json")
-    return sources.joints_m(profile, poses, side)[0]
+    profile = files.parse_profile(json.dumps(hot3d.profile()).encode(), "profile.json")
+    return files.joints_m(profile, poses, side)[0]
 
 
 def hot3d_hand(side: str) -> np.ndarray:

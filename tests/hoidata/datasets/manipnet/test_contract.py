@@ -21,7 +21,7 @@ from tests.builders.corruption import (
     removed,
 )
 from tests.builders.manipnet import HAND, THING, motion_text
-from tests.hoidata.datasets.contract import AdapterContract, FileProblem
+from tests.hoidata.datasets.contract import AdapterContract, Problem
 
 FOLDER = "sequences/tetra_large7"
 LEFT, RIGHT, OBJECT = (f"{FOLDER}/{name}.bvh.gz" for name in ("leftHand", "rightHand", "tetra_large"))
@@ -68,40 +68,38 @@ class TestManipNet(AdapterContract):
     }
 
     @staticmethod
-    def file_problems() -> Iterable[FileProblem]:
+    def file_problems() -> Iterable[Problem]:
         bomb = gzip.compress(bytes(300 << 20), 1, mtime=0)
         mesh = MESH.rpartition("/")[2]
-        yield FileProblem("truncated file", LEFT, at(LEFT, cut_in_half), "gzipped text")
-        yield FileProblem("empty file", OBJECT, at(OBJECT, emptied), "line MOTION")
-        yield FileProblem("malicious pickle", LEFT, at(LEFT, malicious), "gzipped text")
-        yield FileProblem("NaN", OBJECT, at(OBJECT, ending(b"0 0 0 0 0 nan")), "finite")
-        yield FileProblem("infinity", OBJECT, at(OBJECT, ending(b"0 0 0 0 0 inf")), "finite")
-        yield FileProblem("wrong columns", OBJECT, at(OBJECT, ending(b"0 0 0")), "6 columns")
-        yield FileProblem("wrong dtype (words)", OBJECT, at(OBJECT, ending(b"0 0 0 0 0 x")), "numbers")
-        yield FileProblem("missing object file", mesh, removed(MESH), "nothing there")
-        yield FileProblem("frame-count mismatch", LEFT, at(LEFT, in_gzip(last_line)), "motion lines as announced")
-        yield FileProblem("non-UTF-8 text", OBJECT, at(OBJECT, in_gzip(lambda data: b"\xff" + data)), "gzipped text")
-        yield FileProblem("symlink out of the root", LEFT, linked_outside(LEFT), "link that leaves")
-        yield FileProblem("zero-face mesh", MESH, at(MESH, in_gzip(lambda _: NO_FACE_OBJ)), "with faces")
-        yield FileProblem("gzip bomb", OBJECT, holding(OBJECT, bomb), "of text")
-        yield FileProblem(
-            "absurd size (10^9 frames)", OBJECT, at(OBJECT, in_gzip(billion_frames)), "1 to 1000000 frames"
-        )
+        yield "truncated file", LEFT, at(LEFT, cut_in_half), "gzipped text"
+        yield "empty file", OBJECT, at(OBJECT, emptied), "line MOTION"
+        yield "malicious pickle", LEFT, at(LEFT, malicious), "gzipped text"
+        yield "NaN", OBJECT, at(OBJECT, ending(b"0 0 0 0 0 nan")), "finite"
+        yield "infinity", OBJECT, at(OBJECT, ending(b"0 0 0 0 0 inf")), "finite"
+        yield "wrong columns", OBJECT, at(OBJECT, ending(b"0 0 0")), "6 columns"
+        yield "wrong dtype (words)", OBJECT, at(OBJECT, ending(b"0 0 0 0 0 x")), "numbers"
+        yield "missing object file", mesh, removed(MESH), "nothing there"
+        yield "frame-count mismatch", LEFT, at(LEFT, in_gzip(last_line)), "motion lines as announced"
+        yield "non-UTF-8 text", OBJECT, at(OBJECT, in_gzip(lambda data: b"\xff" + data)), "gzipped text"
+        yield "symlink out of the root", LEFT, linked_outside(LEFT), "link that leaves"
+        yield "zero-face mesh", MESH, at(MESH, in_gzip(lambda _: NO_FACE_OBJ)), "with faces"
+        yield "gzip bomb", OBJECT, holding(OBJECT, bomb), "of text"
+        yield "absurd size (10^9 frames)", OBJECT, at(OBJECT, in_gzip(billion_frames)), "1 to 1000000 frames"
 
     @staticmethod
-    def format_problems() -> Iterable[FileProblem]:
+    def format_problems() -> Iterable[Problem]:
         neither = one_after_the_other(removed(LEFT), removed(RIGHT))
         other_bones = zipped(RIGHT, motion_text(THING, [[0.0] * 6] * N_FRAMES))
         shorter = zipped(OBJECT, motion_text(THING, [[0.0] * 6] * (N_FRAMES - 1)))
         narrow = zipped(LEFT, motion_text(HAND.replace("~", ""), [[0.0] * 53] * N_FRAMES))
         unknown = "sequences/tetra_large7/teapot9.bvh.gz"
         renamed = lambda root: (root / OBJECT).rename(root / unknown)  # noqa: E731
-        yield FileProblem("no right hand", FOLDER, removed(RIGHT), f"no {RIGHT}")
-        yield FileProblem("no hands", FOLDER, neither, "object motion only")
-        yield FileProblem("no object", FOLDER, removed(OBJECT), "expected motion of one object, got 0")
-        yield FileProblem("another skeleton", RIGHT, other_bones, "17 joints")
-        yield FileProblem("a frame too few", FOLDER, shorter, "599 frames")
-        yield FileProblem("a column too few", LEFT, narrow, "54 columns")
-        yield FileProblem("an object without a mesh", "teapot9", renamed, "objects/*/teapot9.obj.gz")
-        yield FileProblem("half a vertex", "tetra_large.obj", zipped(MESH, "v 1 2\nf 1 2 3"), "tetra_large.obj")
-        yield FileProblem("no capsules", REFERENCE, holding(REFERENCE, '{"capsules": [1]}'), "hand_reference.json")
+        yield "no right hand", FOLDER, removed(RIGHT), f"no {RIGHT}"
+        yield "no hands", FOLDER, neither, "object motion only"
+        yield "no object", FOLDER, removed(OBJECT), "expected motion of one object, got 0"
+        yield "another skeleton", RIGHT, other_bones, "17 joints"
+        yield "a frame too few", FOLDER, shorter, "599 frames"
+        yield "a column too few", LEFT, narrow, "54 columns"
+        yield "an object without a mesh", "teapot9", renamed, "objects/*/teapot9.obj.gz"
+        yield "half a vertex", "tetra_large.obj", zipped(MESH, "v 1 2\nf 1 2 3"), "tetra_large.obj"
+        yield "no capsules", REFERENCE, holding(REFERENCE, '{"capsules": [1]}'), "hand_reference.json"

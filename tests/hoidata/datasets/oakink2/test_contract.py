@@ -23,7 +23,7 @@ from tests.builders.corruption import (
     set_in,
 )
 from tests.builders.oakink2 import BASE, FIRST, LAPTOP, LID, MUG
-from tests.hoidata.datasets.contract import AdapterContract, FileProblem
+from tests.hoidata.datasets.contract import AdapterContract, Problem
 
 TOKEN = LAPTOP.replace("/", "++")
 HAND, PROGRAM = f"anno_preview/{TOKEN}.pkl", f"program/program_info/{TOKEN}.json"
@@ -87,50 +87,40 @@ class TestOakink2(AdapterContract):
     }
 
     @staticmethod
-    def file_problems() -> Iterable[FileProblem]:
+    def file_problems() -> Iterable[Problem]:
         long = torch.zeros(1).expand(10**9)
-        yield FileProblem("truncated file", HAND, at(HAND, cut_in_half), "pickle")
-        yield FileProblem("empty file", PROGRAM, at(PROGRAM, emptied), "JSON")
-        yield FileProblem("malicious pickle", HAND, mano("rh__tsl", Command()), "not allowed")
-        yield FileProblem("NaN", HAND, mano("rh__tsl", torch.full((1, 3), torch.nan)), "finite")
-        yield FileProblem("infinity", HAND, pose(lambda matrix: matrix.__setitem__((0, 3), np.inf)), "finite")
-        yield FileProblem("wrong columns", HAND, mano("rh__betas", torch.zeros(1, 11)), "shape (10,)")
-        yield FileProblem("wrong dtype (words)", HAND, mano("rh__betas", "words"), "arrays of shape")
-        yield FileProblem("missing object file", "align_ds", removed(MESH), "one mesh, OBJ or PLY")
-        yield FileProblem("frame-count mismatch", HAND, edited(set_in("raw_mano", value={})), "parameters of a hand")
-        yield FileProblem("symlink out of the root", HAND, linked_outside(HAND), "link that leaves")
-        yield FileProblem("zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces")
-        yield FileProblem("absurd size (face)", MESH, holding(MESH, FAR_CORNER_OBJ), "face corners")
-        yield FileProblem("absurd size (tensor of 10^9)", HAND, mano("rh__betas", long), "larger than")
+        yield "truncated file", HAND, at(HAND, cut_in_half), "pickle"
+        yield "empty file", PROGRAM, at(PROGRAM, emptied), "JSON"
+        yield "malicious pickle", HAND, mano("rh__tsl", Command()), "not allowed"
+        yield "NaN", HAND, mano("rh__tsl", torch.full((1, 3), torch.nan)), "finite"
+        yield "infinity", HAND, pose(lambda matrix: matrix.__setitem__((0, 3), np.inf)), "finite"
+        yield "wrong columns", HAND, mano("rh__betas", torch.zeros(1, 11)), "shape (10,)"
+        yield "wrong dtype (words)", HAND, mano("rh__betas", "words"), "arrays of shape"
+        yield "missing object file", "align_ds", removed(MESH), "one mesh, OBJ or PLY"
+        yield "frame-count mismatch", HAND, edited(set_in("raw_mano", value={})), "parameters of a hand"
+        yield "symlink out of the root", HAND, linked_outside(HAND), "link that leaves"
+        yield "zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces"
+        yield "absurd size (face)", MESH, holding(MESH, FAR_CORNER_OBJ), "face corners"
+        yield "absurd size (tensor of 10^9)", HAND, mano("rh__betas", long), "larger than"
 
     @staticmethod
-    def format_problems() -> Iterable[FileProblem]:
+    def format_problems() -> Iterable[Problem]:
         frames = "mocap_frame_id_list"
-        yield FileProblem("no program", PROGRAM, removed(PROGRAM), "expected a file")
-        yield FileProblem("no names", NAMES, removed(NAMES), "expected a file")
-        yield FileProblem("a list", HAND, holding(HAND, pickle.dumps([1])), "a dictionary with")
-        yield FileProblem("no poses", HAND, edited(lambda values: values.pop("obj_transf")), "'obj_transf'")
-        yield FileProblem("poses in a list", LID, edited(set_in("obj_transf", LID, value=[1])), "by frame number")
-        yield FileProblem("hands in a list", "raw_mano", edited(set_in("raw_mano", value=[1])), "by frame number")
-        yield FileProblem("words as frames", frames, edited(set_in(frames, value=["1"])), "frame numbers")
-        yield FileProblem("no frames", frames, edited(set_in(frames, value=[])), "frame numbers from 0")
-        yield FileProblem("frames twice", frames, edited(set_in(frames, value=[5, 5, 6])), "rising")
-        yield FileProblem(
-            "frames of a year", frames, edited(set_in(frames, value=[0, 9_000_000])), "without great gaps"
-        )
-        yield FileProblem("a place beyond all rooms", LID, pose(lambda matrix: matrix.__imul__(1e300)), "at most 1e+06")
-        yield FileProblem("a path as part", "obj_list", edited(set_in("obj_list", value=["../x"])), "part ids such as")
-        yield FileProblem(
-            "rows", "frame 14", pose(lambda matrix: matrix.__setitem__(slice(None), matrix.T.copy())), "rotation"
-        )
-        yield FileProblem(
-            "a mirror", "frame 14", pose(lambda matrix: matrix.__imul__([[-1], [1], [1], [1]])), "a mirror"
-        )
-        yield FileProblem("no quaternion", "pose_coeffs", mano("lh__pose_coeffs", torch.zeros(1, 16, 4)), "in frame 14")
-        yield FileProblem("no primitive", PROGRAM, first(lambda entry: entry.pop("primitive")), "'primitive'")
-        yield FileProblem(
-            "objects in a text", PROGRAM, first(lambda entry: entry.update(obj_list=MUG)), "part ids such as"
-        )
-        yield FileProblem(
-            "two meshes", BASE, holding(f"object_repair/align_ds/{BASE}/scan.ply", b""), "model.obj, scan.ply"
-        )
+        yield "no program", PROGRAM, removed(PROGRAM), "expected a file"
+        yield "no names", NAMES, removed(NAMES), "expected a file"
+        yield "a list", HAND, holding(HAND, pickle.dumps([1])), "a dictionary with"
+        yield "no poses", HAND, edited(lambda values: values.pop("obj_transf")), "'obj_transf'"
+        yield "poses in a list", LID, edited(set_in("obj_transf", LID, value=[1])), "by frame number"
+        yield "hands in a list", "raw_mano", edited(set_in("raw_mano", value=[1])), "by frame number"
+        yield "words as frames", frames, edited(set_in(frames, value=["1"])), "frame numbers"
+        yield "no frames", frames, edited(set_in(frames, value=[])), "frame numbers from 0"
+        yield "frames twice", frames, edited(set_in(frames, value=[5, 5, 6])), "rising"
+        yield "frames of a year", frames, edited(set_in(frames, value=[0, 9_000_000])), "without great gaps"
+        yield "a place beyond all rooms", LID, pose(lambda matrix: matrix.__imul__(1e300)), "at most 1e+06"
+        yield "a path as part", "obj_list", edited(set_in("obj_list", value=["../x"])), "part ids such as"
+        yield "rows", "frame 14", pose(lambda matrix: matrix.__setitem__(slice(None), matrix.T.copy())), "rotation"
+        yield "a mirror", "frame 14", pose(lambda matrix: matrix.__imul__([[-1], [1], [1], [1]])), "a mirror"
+        yield "no quaternion", "pose_coeffs", mano("lh__pose_coeffs", torch.zeros(1, 16, 4)), "in frame 14"
+        yield "no primitive", PROGRAM, first(lambda entry: entry.pop("primitive")), "'primitive'"
+        yield "objects in a text", PROGRAM, first(lambda entry: entry.update(obj_list=MUG)), "part ids such as"
+        yield "two meshes", BASE, holding(f"object_repair/align_ds/{BASE}/scan.ply", b""), "model.obj, scan.ply"

@@ -23,7 +23,7 @@ from tests.builders.corruption import (
     removed,
     set_in,
 )
-from tests.hoidata.datasets.contract import AdapterContract, FileProblem
+from tests.hoidata.datasets.contract import AdapterContract, Problem
 
 NAME = taco.NAMES[0]
 HAND = f"Hand_Poses/{NAME}/right_hand.pkl"
@@ -63,46 +63,38 @@ class TestTaco(AdapterContract):
     }
 
     @staticmethod
-    def file_problems() -> Iterable[FileProblem]:
+    def file_problems() -> Iterable[Problem]:
         long = torch.zeros(1).expand(10**9)
         infinite = at(TOOL, in_array(lambda poses: poses + np.float32(np.inf)))
-        yield FileProblem("truncated file", HAND, at(HAND, cut_in_half), "pickle")
-        yield FileProblem("empty file", TOOL, at(TOOL, emptied), "NumPy file")
-        yield FileProblem("malicious pickle", HAND, edited(set_in("00003", value=Command())), "not allowed")
-        yield FileProblem("NaN", HAND, edited(lambda data: data["00003"]["hand_trans"].fill_(np.nan)), "finite")
-        yield FileProblem("infinity", TOOL, infinite, "finite")
-        yield FileProblem("wrong columns", HAND, edited(set_in("00003", "hand_pose", value=torch.zeros(47))), "48")
-        yield FileProblem("wrong dtype (words)", HAND, edited(set_in("00003", "hand_pose", value="words")), "numbers")
-        yield FileProblem("missing object file", MESH, removed(MESH), "nothing there")
-        yield FileProblem("frame-count mismatch", NAME, at(TOOL, in_array(lambda poses: poses[:-1])), "frames")
-        yield FileProblem("symlink out of the root", HAND, linked_outside(HAND), "link that leaves")
-        yield FileProblem("zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces")
-        yield FileProblem(
-            "absurd size (tensor of 10^9)", HAND, edited(set_in("00003", "hand_pose", value=long)), "larger than"
-        )
-        yield FileProblem("absurd size (header)", TOOL, at(TOOL, huge_npy), "bytes of data")
+        yield "truncated file", HAND, at(HAND, cut_in_half), "pickle"
+        yield "empty file", TOOL, at(TOOL, emptied), "NumPy file"
+        yield "malicious pickle", HAND, edited(set_in("00003", value=Command())), "not allowed"
+        yield "NaN", HAND, edited(lambda data: data["00003"]["hand_trans"].fill_(np.nan)), "finite"
+        yield "infinity", TOOL, infinite, "finite"
+        yield "wrong columns", HAND, edited(set_in("00003", "hand_pose", value=torch.zeros(47))), "48"
+        yield "wrong dtype (words)", HAND, edited(set_in("00003", "hand_pose", value="words")), "numbers"
+        yield "missing object file", MESH, removed(MESH), "nothing there"
+        yield "frame-count mismatch", NAME, at(TOOL, in_array(lambda poses: poses[:-1])), "frames"
+        yield "symlink out of the root", HAND, linked_outside(HAND), "link that leaves"
+        yield "zero-face mesh", MESH, holding(MESH, NO_FACE_OBJ), "with faces"
+        yield "absurd size (tensor of 10^9)", HAND, edited(set_in("00003", "hand_pose", value=long)), "larger than"
+        yield "absurd size (header)", TOOL, at(TOOL, huge_npy), "bytes of data"
 
     @staticmethod
-    def format_problems() -> Iterable[FileProblem]:
+    def format_problems() -> Iterable[Problem]:
         second = f"Object_Poses/{NAME}/tool_013.npy"
         tensor = edited(lambda data: data.update({"00003": data["00003"]["hand_pose"]}))
         by_rows = at(TOOL, in_array(lambda poses: poses.transpose(0, 2, 1)))
         mirrored = at(TOOL, in_array(lambda poses: poses * [[[-1], [1], [1], [1]]]))
-        yield FileProblem("no hand file", HAND, removed(HAND), "expected a file")
-        yield FileProblem("a list", HAND, holding(HAND, pickle.dumps([1, 2])), "expected a dictionary, got list")
-        yield FileProblem("an entry that is a tensor", "00003", tensor, "dictionary")
-        yield FileProblem(
-            "no translation", "00003", edited(lambda data: data["00003"].pop("hand_trans")), "'hand_trans'"
-        )
-        yield FileProblem("no tool", "tool_<id>.npy", removed(TOOL), "poses of one object, got 0")
-        yield FileProblem("two tools", "tool_<id>.npy", holding(second, b""), "got 2: tool_012.npy, tool_013.npy")
-        yield FileProblem(
-            "another count", "target", at(TARGET, in_array(lambda p: p[:-1])), "30 frames as the tool, got 29"
-        )
-        yield FileProblem("rows", "tool_012.npy/frame 0", by_rows, "a rotation and a shift")
-        yield FileProblem("a mirror", "tool_012.npy", mirrored, "a mirror")
-        yield FileProblem("3x4", TOOL, at(TOOL, in_array(lambda poses: poses[:, :3])), "of shape (frames, 4, 4)")
-        yield FileProblem("objects", TOOL, holding(TOOL, npy_of(np.array([None]))), "tool_012.npy")
-        yield FileProblem(
-            "no touch", NAME, at(TOOL, in_array(lambda p: p + FAR_AWAY)), "a hand within 2 cm of the tool"
-        )
+        yield "no hand file", HAND, removed(HAND), "expected a file"
+        yield "a list", HAND, holding(HAND, pickle.dumps([1, 2])), "expected a dictionary, got list"
+        yield "an entry that is a tensor", "00003", tensor, "dictionary"
+        yield "no translation", "00003", edited(lambda data: data["00003"].pop("hand_trans")), "'hand_trans'"
+        yield "no tool", "tool_<id>.npy", removed(TOOL), "poses of one object, got 0"
+        yield "two tools", "tool_<id>.npy", holding(second, b""), "got 2: tool_012.npy, tool_013.npy"
+        yield "another count", "target", at(TARGET, in_array(lambda p: p[:-1])), "30 frames as the tool, got 29"
+        yield "rows", "tool_012.npy/frame 0", by_rows, "a rotation and a shift"
+        yield "a mirror", "tool_012.npy", mirrored, "a mirror"
+        yield "3x4", TOOL, at(TOOL, in_array(lambda poses: poses[:, :3])), "of shape (frames, 4, 4)"
+        yield "objects", TOOL, holding(TOOL, npy_of(np.array([None]))), "tool_012.npy"
+        yield "no touch", NAME, at(TOOL, in_array(lambda p: p + FAR_AWAY)), "a hand within 2 cm of the tool"
