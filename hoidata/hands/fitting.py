@@ -65,9 +65,7 @@ def fit_hands(
 
     Args:
         keypoints_m: per side (frame, 21, 3) world positions; NaN for an unknown keypoint.
-        hands: models of both sides.
         betas: (10,) the shape, if known. By default one shape of both sides is fitted first (``fit_shape``).
-        settings: weights, priors and steps.
 
     Raises:
         BadInput: an array of another shape, or a frame with less than three known keypoints on the palm.
@@ -145,7 +143,6 @@ def pose_precision(rest: np.ndarray, settings: FitSettings) -> np.ndarray:
 
     Args:
         rest: (21, 3) keypoints at rest.
-        settings: standard deviations.
     """
     palm_normal = _unit(np.cross(rest[1] - rest[0], rest[7] - rest[0]))
     precision = np.zeros((5, 9, 9))

@@ -53,7 +53,6 @@ def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "", 
     """Read an object from an OBJ, PLY, STL, GLB or URDF file, or from a folder with a URDF file.
 
     Args:
-        path: the file or folder.
         unit: "m", "cm", "mm", "dm" or "inch"; metres by default.
         up: the file's axis that points up, such as "z" or "-y"; guessed by default (GLB: y, URDF: z).
         hinge: of a mesh file "px,py,pz dx,dy,dz", a point on the axis and its direction in the file's unit and axes; or

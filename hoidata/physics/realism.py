@@ -63,7 +63,6 @@ def force_columns(
         frame: (contact,) index of the contact's frame.
         arms: (contact, 3) from the reference point to the contact.
         edges: (contact, edge, 3).
-        n_frames: of the scene.
 
     Returns:
         Columns (6, n) sorted by frame, and offsets (frame + 1,) of each frame's first column.
@@ -86,7 +85,6 @@ def wrench_residuals(
         columns: (6, column) of all frames; frame i has ``columns[:, offsets[i] : offsets[i + 1]]``, maybe none.
         offsets: (frame + 1,).
         wrenches: (frame, 6). Force and torque may have any units, which the norm mixes.
-        max_steps: limit of the solver.
 
     Returns:
         (frame, 6).
@@ -213,8 +211,6 @@ def score(scene: Scene, variant: Variant, frames: np.ndarray | None = None) -> R
     """Score the physical realism of a scene of at least 3 frames.
 
     Args:
-        scene: the motion.
-        variant: how to compute residuals.
         frames: (frame,) bool, the frames to select; ``scene.lifted`` by default.
     """
     frames = scene.lifted if frames is None else frames
@@ -261,7 +257,6 @@ def smoothness_m_s2(joints_m: np.ndarray, wrist_rotmats: np.ndarray, fps: float)
     Args:
         joints_m: (frame, joint, 3) world, the wrist first, NaN without the hand.
         wrist_rotmats: (frame, 3, 3) world_from_wrist.
-        fps: frames per second.
 
     Raises:
         ValueError: the hand has fewer than three successive frames.

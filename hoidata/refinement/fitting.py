@@ -44,10 +44,8 @@ def fit_hands(
     """Fit hand poses to generated keypoints, each frame by itself, after one shape per hand over all frames.
 
     Args:
-        pair: hand models of both sides.
         betas: (2, 10) shapes of the left and the right hand if they are known; None: fitted.
         keypoint_ids: (keypoint,) vertices, the same on both sides.
-        generated: keypoints of each hand.
         template_m: (2, 778, 3) personal rest meshes instead of the models' templates; not used if shapes are fitted.
 
     Returns:

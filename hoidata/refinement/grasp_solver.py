@@ -85,15 +85,10 @@ class GraspObjective:
     """Cost of a hand's pose in each frame, and its normal equations; everything in the frame of the part.
 
     Args:
-        skin: the hand's vertices.
-        field: distances to the object.
         original: (frame,) pose before the correction.
         frames: (frame,) index of each frame in the object's motion.
         in_grasp: (frame,) bool.
         other: (frame,) capsules of the other hand, if any.
-        settings: standard deviations.
-        attraction: how far skin is attracted.
-        part: the part that the hand grasps.
         passed: (frame,) bool, the other part moves past the hand; None for never.
     """
 

@@ -83,7 +83,6 @@ class SkinnedHand:
     """Vertices of a hand model with a fixed shape.
 
     Args:
-        model: one side of a hand model.
         betas: (10,) shape coefficients.
         template_m: (778, 3) personal rest mesh instead of the model's template.
         ids: (vertex,) which vertices, all by default.

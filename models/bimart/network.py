@@ -139,7 +139,6 @@ class Denoiser(nn.Module):
         Args:
             x: (B, F, D) noised, normalised values.
             steps: (B,) diffusion steps, 0 to 999.
-            windows: the condition.
             drop: (B,) bool, windows whose contact map is dropped.
 
         Returns:

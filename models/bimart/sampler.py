@@ -78,7 +78,6 @@ def paper_step(keypoints_m: Tensor, target: ContactTarget, scale: Tensor, window
 
     Args:
         keypoints_m: (B, F, 2, J, 3).
-        target: the contact map.
         scale: (2, J, 3) metres per normalised unit.
         window_frames: frames of a window; a longer motion gets a longer step.
 
@@ -102,7 +101,6 @@ def metre_step(keypoints_m: Tensor, target: ContactTarget) -> Tensor:
 
     Args:
         keypoints_m: (B, F, 2, J, 3).
-        target: the contact map.
 
     Returns:
         (B, F, 2, J, 3) metres.

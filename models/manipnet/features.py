@@ -68,9 +68,7 @@ def pose_features(hand: TrackedHand, state: HandState, settings: FeatureSettings
     """Pose of a hand as the network reads it.
 
     Args:
-        hand: the hand's skeleton and capsules.
         state: (frame,) the hand in its wrist's frame.
-        settings: of the features.
 
     Returns:
         (frame, 9 joints + 15 + 6 palm capsules), metres, canonical axes: joint positions, tips, starts and ends of the
@@ -99,9 +97,7 @@ def joint_rotmats_of(hand: TrackedHand, pose: np.ndarray, settings: FeatureSetti
     The predicted axes are orthonormalised by Gram-Schmidt, z first.
 
     Args:
-        hand: the hand's skeleton.
         pose: (frame, 192 or more).
-        settings: of the features.
 
     Returns:
         (frame, joint, 3, 3) wrist_from_joint; ``hand.finger_rotmats`` converts them to local rotations.

@@ -75,8 +75,6 @@ def _write_bvh(
     """Write one BVH file.
 
     Args:
-        path: of the file.
-        names: of the joints.
         tree: index of each joint's parent; -1 for the root.
         positions_m: (frame, joint, 3) in the parent joint's frame.
         rotations: (frame x joint) relative to the parent joint.

@@ -126,12 +126,7 @@ def export_store(
     """Write the clips of a store into a new folder. Equal stores give equal bytes.
 
     Args:
-        store: the store of clips.
-        to: the format, a key of ``FORMATS``.
-        out: the output folder; must not exist.
         clip_ids: the clips to export; empty for all.
-        for_own_use: whether to export data that must not be shared.
-        progress: whether to show a progress bar.
 
     Returns:
         The content of export.json.

@@ -179,7 +179,6 @@ class Source:
     """The clips of a store, with sentences and subsets from the folders of the stages next to it, if present.
 
     Args:
-        store: the store of clips.
         clip_ids: the clips to export; empty for all.
     """
 

@@ -67,7 +67,6 @@ def code_today(root: Path, only: Collection[str] | None = None) -> dict[str, dic
     """The content of the files of ``code/`` for the present code, by path (``code/convert/grab.json``).
 
     Args:
-        root: the project folder.
         only: paths of the files to compute; None for all.
     """
     plain = read_file(root / "params.yaml")
@@ -127,8 +126,6 @@ def profile_settings(plain: dict[str, Any], params: dict[str, Any], name: str) -
     """The settings of a file's stages, as JSON, if the chosen profile overrides them; else empty.
 
     Args:
-        plain: params.yaml without the profile's overlay.
-        params: params.yaml with the overlay.
         name: the file of ``code/``, without suffix.
     """
     settings = _settings_read(params, name)

@@ -100,9 +100,6 @@ def train_into(out: Path, paths: StagePaths, params: Mapping[str, Any], progress
     """Train ``paths.model`` and write the checkpoint.
 
     Args:
-        out: the folder of the checkpoint.
-        paths: of the stage run.
-        params: the settings of the network.
         progress: the folder with the state of a killed training.
         code: the file with the digests of the stage's code.
     """
