@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from pipelines.commands.project import hands_of_dataset
+from pipelines.commands.project import hands_of_data
 
 if TYPE_CHECKING:
     import numpy as np
@@ -33,7 +33,7 @@ def compare(
     from hoidata.store.annotated import load_annotated
 
     values, others = (
-        corpus_statistics(load_annotated(folder, hands_of_dataset(folder)), clips) for folder in (corpus, reference)
+        corpus_statistics(load_annotated(folder, hands_of_data(folder)), clips) for folder in (corpus, reference)
     )
     rows = compare_corpora(values, others)
     table = Table(title=f"{corpus} compared with {reference}", box=box.SIMPLE)

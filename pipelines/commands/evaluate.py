@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from pipelines.commands.project import hands_of_dataset
+from pipelines.commands.project import hands_of_data
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -54,7 +54,7 @@ def evaluate(
     from pipelines.stages.evaluate import trained_encoders
 
     encoders = trained_encoders(evaluators or evaluators_of(reference))
-    hands, chosen_metrics = hands_of_dataset(reference), select_metrics(filter(None, metrics.split(",")))
+    hands, chosen_metrics = hands_of_data(reference), select_metrics(filter(None, metrics.split(",")))
     results = evaluate_store(
         store, reference, hands, split=split, metrics=chosen_metrics, encoders=encoders, jobs=jobs(), progress=True
     )

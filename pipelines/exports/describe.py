@@ -183,6 +183,7 @@ def _responsible(store: Store, description: Description) -> dict[str, Any]:
     facts = dataset_facts(str(info["dataset"]))
     errors_m = rows["fit_error_m"].dropna().tolist()  # of hands fitted to keypoints
     verbs = Counter(rows["verb"].dropna().tolist())
+    verbs_by_count = sorted(verbs.items(), key=lambda pair: (-pair[1], str(pair[0])))
     source = facts.paper if facts and facts.paper else info["dataset"]
     limits = [f"gravity: {info['frame']['gravity']}"]
     if errors_m:
@@ -205,7 +206,7 @@ def _responsible(store: Store, description: Description) -> dict[str, Any]:
         "dataAnnotationProtocol": "verbs and objects as labelled by the source; sentences from rules applied to them",
         "dataBiases": [
             f"{rows['subject'].nunique()} subjects, {counts['objects']} objects, {len(verbs)} verbs; most frequent: "
-            + ", ".join(f"{verb} ({count})" for verb, count in sorted(verbs.items(), key=_by_count)[:3])
+            + ", ".join(f"{verb} ({count})" for verb, count in verbs_by_count[:3])
         ],
         "dataLimitations": limits,
         "dataUseCases": ["training and evaluation of models of hand-object motion"],
@@ -214,10 +215,6 @@ def _responsible(store: Store, description: Description) -> dict[str, Any]:
             ["motion and shape of hands of persons known by the source's ids"]
         ),
     }  # fmt: skip
-
-
-def _by_count(pair: tuple[Any, int]) -> tuple[int, str]:
-    return -pair[1], str(pair[0])
 
 
 def _name(store: Store) -> str:

@@ -143,12 +143,3 @@ def test_scattered_squares_equal_matrix_products():
             np.tril((gradient[in_frame].T * weight[in_frame]) @ gradient[in_frame])
         )
         assert vector[index] == pytest.approx(-gradient[in_frame].T @ (weight[in_frame] * residual[in_frame]))
-
-
-def test_the_step_between_finger_poses_on_both_sides_of_pi_is_the_short_one() -> None:
-    """Stored rotations are at most pi, so 179 degrees may be followed by -179: 2 degrees apart, not 358."""
-    before, after = any_pose(), any_pose()
-    before.fingers[:, 4], after.fingers[:, 4] = np.deg2rad((0, 0, 179.0)), np.deg2rad((0, 0, -179.0))
-    step = before.step_to(after)[:, 6:].reshape(-1, 15, 3)
-    np.testing.assert_allclose(step[:, 4], np.deg2rad([(0, 0, 2.0)] * FRAMES), atol=1e-12)
-    assert np.abs(step[:, np.arange(15) != 4]).max() == 0
