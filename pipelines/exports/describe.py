@@ -10,7 +10,6 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-import orjson
 import pyarrow as pa
 import pyarrow.parquet as pq
 import yaml
@@ -21,7 +20,7 @@ from hoidata.store.fields import STORE_FILES, StoreFile
 from hoidata.store.info import embedded_hand_warning
 from hoidata.store.store import Store
 from pipelines.exports.licences import OWN_USE, ArrayLicence, licences_of
-from pipelines.exports.motion import Column
+from pipelines.exports.motion import Column, write_json
 
 _MARKUP = re.compile(r"[\\`*_\[\]|~$]")
 CROISSANT = "http://mlcommons.org/croissant/1.1"
@@ -74,8 +73,7 @@ class Description:
 def write_description(folder: Path, store: Store, to: str, description: Description) -> None:
     """Write croissant.json and README.md about the files in ``folder``; for the format croissant, about the store."""
     root = store.folder if to == "croissant" else folder
-    values = croissant(root, store, description)
-    (folder / "croissant.json").write_bytes(orjson.dumps(values, option=orjson.OPT_INDENT_2) + b"\n")
+    write_json(folder / "croissant.json", croissant(root, store, description))
     (folder / "README.md").write_text(dataset_card(root, store, description), encoding="utf-8")
 
 
