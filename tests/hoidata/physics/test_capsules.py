@@ -11,7 +11,7 @@ from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import TIP_VERTICES, load_embedded_hands, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.physics.capsules import Capsules, ObjectPoses, capsule_contacts
-from hoidata.physics.mano_capsules import N_CAPSULES, THUMB_CAPSULES, fit_capsules, hand_capsules
+from hoidata.physics.mano_capsules import N_CAPSULES, fit_capsules, hand_capsules
 from tests.builders.clips import random_hand
 from tests.builders.objects import box_model, two_parts
 
@@ -159,7 +159,7 @@ def test_capsules_of_a_posed_hand_are_inside_its_skin_and_reach_the_fingertips(s
     assert np.median(np.abs(gaps)) < 0.004
     assert np.abs(gaps[:, list(TIP_VERTICES)]).max() < 0.003
     assert ((local.radius_m > 0.004) & (local.radius_m < 0.025)).all()
-    assert [local.joint[number] for number in THUMB_CAPSULES] == [13, 14, 15]
+    assert [local.joint[number] for number in (16, 17, 18)] == [13, 14, 15]
 
 
 def test_both_sides_have_the_same_radii():
