@@ -9,7 +9,6 @@ import typer
 from hoidata.errors import HoidataError, explain_machine_errors
 from pipelines.commands import (
     adapters,
-    compare,
     evaluate,
     export,
     graph,
@@ -47,7 +46,7 @@ app.command("profile")(raw.profile)
 app.command("settings")(settings.settings)
 app.command("share")(share.share)
 app.command("evaluate")(evaluate.evaluate)
-app.command("compare")(compare.compare)
+app.command("compare")(evaluate.compare)
 app.command("controls")(evaluate.controls)
 app.command("table")(evaluate.table)
 app.command("generate")(motions.generate)

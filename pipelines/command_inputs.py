@@ -121,8 +121,6 @@ def trained_run(
     """The first dataset that has all of these networks, or the one that is named.
 
     Args:
-        family: the model family, for error messages.
-        networks: names of the networks; all must be trained.
         model: the dataset to use, or "" for the first one that has them.
         project: the datasets, and the hand model that the networks must have been trained with.
 

@@ -46,7 +46,6 @@ def bring_up_to_date(targets: list[str], profile: str = "", jobs: int = 0, force
         targets: as for ``dvc repro``, with ``{profile}`` for the profile; empty: the whole graph.
         profile: the profile to choose first, as `hoidata profile` does; empty: the current one.
         jobs: number of parallel stages; 0: one per core, at most 4.
-        force: run the targets even if nothing has changed.
     """
     if profile:
         if profile not in PROFILES:

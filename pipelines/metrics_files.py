@@ -27,7 +27,6 @@ def write_dvc_plots(out: Path, metrics: Path, checkpoints: Path, families: Mappi
     Files: ``bars/<dataset>.csv`` (one line per family), ``losses/<dataset>-<network>.csv`` (validation loss by step).
 
     Args:
-        metrics: folder with the metrics of each dataset.
         checkpoints: folder with the networks of each dataset; untrained networks are skipped.
         families: by dataset, in the order of the lines.
     """

@@ -61,7 +61,6 @@ def reproduce_in_parallel(
     Args:
         targets: stages; empty for all.
         wrap: decorates the function that runs one stage, for instance as a Prefect task.
-        force: run the targets even if DVC finds them unchanged.
 
     Raises:
         BadInput: another run is in progress in this project.
@@ -119,7 +118,6 @@ def stale_stages(targets: list[str], force: bool = False) -> Plan:
     """The stages that must run for the targets.
 
     Args:
-        targets: stages; empty for all.
         force: count the targets as changed.
 
     Raises:

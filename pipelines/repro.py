@@ -26,8 +26,6 @@ def reproduce(
     Args:
         targets: DVC targets; empty for all.
         jobs: number of parallel stages; 0: one per core, at most 4.
-        wrap: see ``reproduce_in_parallel``.
-        force: see ``reproduce_in_parallel``.
 
     Raises:
         MissingResource: raw or MANO files that a stale stage needs are missing.

@@ -44,7 +44,6 @@ def write_page_from(folder: Path, clip_id: str, hands: HandPair, out: Path) -> P
     """Write the page of a clip of ``folder`` to the folder ``out``; without an id, the page of the dataset.
 
     Args:
-        folder: an annotated dataset, or a store of clips.
         clip_id: "" for the dataset.
 
     Raises:

@@ -67,18 +67,6 @@ def canonical_rotvec(rotvec: np.ndarray) -> np.ndarray:
     return canonical
 
 
-def nearest_rotvec(rotvec: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """The same rotations as ``rotvec`` (..., 3), with one full turn added or removed to be closest to ``reference``.
-
-    Only then are differences of axis-angles meaningful: 179 and -179 degrees are 2 degrees apart.
-    """
-    angle = np.linalg.norm(rotvec, axis=-1, keepdims=True)
-    full_turn = 2 * np.pi * np.divide(rotvec, angle, out=np.zeros_like(rotvec), where=angle > 0)
-    candidates = np.stack([rotvec, rotvec - full_turn, rotvec + full_turn])
-    nearest = np.linalg.norm(candidates - reference, axis=-1).argmin(axis=0)
-    return np.take_along_axis(candidates, nearest[None, ..., None], axis=0)[0]
-
-
 def rotation_angle(rotmat: np.ndarray) -> np.ndarray:
     """Angle of rotation matrices (..., 3, 3), radians in [0, pi]."""
     return np.arccos(np.clip((np.trace(rotmat, axis1=-2, axis2=-1) - 1) / 2, -1, 1))

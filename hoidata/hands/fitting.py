@@ -7,7 +7,7 @@ Units are metres and radians. Keypoints are in the order of the 21 joints (``hoi
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -22,26 +22,22 @@ from hoidata.hands.tracks import kinematics_of
 KNUCKLES = [1, 4, 7, 10, 13]
 THUMB = 4
 # Fingertips touch objects, so they count most. Datasets disagree about the positions of knuckles and wrist.
-DEFAULT_WEIGHTS = (1.0, *(1.0, 2.0, 3.0) * 5, *(6.0,) * 5)
+WEIGHTS = (1.0, *(1.0, 2.0, 3.0) * 5, *(6.0,) * 5)  # (21,) of each keypoint's squared error
+NOISE_M = 0.003  # standard deviation of a keypoint of weight 1
 
+# Standard deviations of a finger joint's angles around the model's mean pose.
+BEND_RAD = 1.5  # about its hinge axis
+SPREAD_RAD = 0.25  # sideways
+TWIST_RAD = 0.2  # about its bone
+THUMB_RAD = 1.0  # of a thumb joint about both axes across its bone
+SHAKE_RAD = 0.1  # from its mean over three neighbouring frames
 
-@dataclass(frozen=True)
-class FitSettings:
-    """Weights, priors and steps of a fit; angles are standard deviations around the model's mean pose."""
-
-    weights: tuple[float, ...] = DEFAULT_WEIGHTS  # (21,) of each keypoint's squared error
-    noise_m: float = 0.003  # standard deviation of a keypoint of weight 1
-    bend_rad: float = 1.5  # of a finger joint about its hinge axis
-    spread_rad: float = 0.25  # of a finger joint sideways
-    twist_rad: float = 0.2  # of a finger joint about its bone
-    thumb_rad: float = 1.0  # of a thumb joint about both axes across its bone
-    shake_rad: float = 0.1  # of a finger joint from its mean over three neighbouring frames
-    shape_frames: int = 100  # most frames per hand that determine the shape, evenly spaced
-    # Weight per frame of a standard normal prior on the shape. It grows with the frames because joint definitions
-    # differ in the same way in all frames. Without it, ManipNet's hands lead to betas of 14.
-    shape_prior: float = 0.3
-    shape_steps: int = 12
-    pose_steps: int = 15
+SHAPE_FRAMES = 100  # most frames per hand that determine the shape, evenly spaced
+# Weight per frame of a standard normal prior on the shape. It grows with the frames because joint definitions differ in
+# the same way in all frames. Without it, ManipNet's hands lead to betas of 14.
+SHAPE_PRIOR = 0.3
+SHAPE_STEPS = 12
+POSE_STEPS = 15
 
 
 @dataclass(frozen=True)
@@ -56,55 +52,46 @@ class HandFit:
 
 
 def fit_hands(
-    keypoints_m: Mapping[Side, np.ndarray],
-    hands: HandPair,
-    betas: np.ndarray | None = None,
-    settings: FitSettings | None = None,
+    keypoints_m: Mapping[Side, np.ndarray], hands: HandPair, betas: np.ndarray | None = None
 ) -> dict[Side, HandFit]:
     """Fit one or both hands of a person over consecutive frames.
 
     Args:
         keypoints_m: per side (frame, 21, 3) world positions; NaN for an unknown keypoint.
-        hands: models of both sides.
         betas: (10,) the shape, if known. By default one shape of both sides is fitted first (``fit_shape``).
-        settings: weights, priors and steps.
 
     Raises:
         BadInput: an array of another shape, or a frame with less than three known keypoints on the palm.
     """
-    settings = settings or FitSettings()
     if betas is None:
-        betas = fit_shape(keypoints_m, hands, settings)
+        betas = fit_shape(keypoints_m, hands)
     shape = torch.as_tensor(np.asarray(betas, dtype=np.float64)).reshape(1, N_SHAPE)
-    return {side: _fit_side(side, points, hands[side], shape, settings) for side, points in keypoints_m.items()}
+    return {side: _fit_side(side, points, hands[side], shape) for side, points in keypoints_m.items()}
 
 
-def fit_shape(
-    keypoints_m: Mapping[Side, np.ndarray], hands: HandPair, settings: FitSettings | None = None
-) -> np.ndarray:
+def fit_shape(keypoints_m: Mapping[Side, np.ndarray], hands: HandPair) -> np.ndarray:
     """Fit one shape (10,) to the keypoints of both sides, under a standard normal prior.
 
-    Up to ``settings.shape_frames`` evenly spaced frames per side are used. They need not be consecutive.
+    Up to ``SHAPE_FRAMES`` evenly spaced frames per side are used. They need not be consecutive.
     """
-    settings = replace(settings or FitSettings(), shake_rad=np.inf)
     problems, poses = [], []
     betas = torch.zeros(1, N_SHAPE, dtype=torch.float64)
     for side, points in keypoints_m.items():
-        chosen = np.unique(np.linspace(0, len(points) - 1, min(settings.shape_frames, len(points))).astype(int))
-        problems.append(_problem(side, points[chosen], hands[side], settings))
+        chosen = np.unique(np.linspace(0, len(points) - 1, min(SHAPE_FRAMES, len(points))).astype(int))
+        problems.append(_problem(side, points[chosen], hands[side], smooth=0.0))
         poses.append(_initial_pose(problems[-1]))
     n_frames = sum(len(problem.keypoints) for problem in problems)
-    prior = settings.noise_m**2 * max(1.0, settings.shape_prior * n_frames)
-    for _ in range(settings.shape_steps):
+    prior = NOISE_M**2 * max(1.0, SHAPE_PRIOR * n_frames)
+    for _ in range(SHAPE_STEPS):
         betas, trials = shape_step(problems, poses, betas, prior)
         poses = [better_pose(*triple, betas) for triple in zip(problems, trials, poses, strict=True)]
     return betas[0].numpy()
 
 
-def _fit_side(side: Side, points: np.ndarray, model: HandModel, betas: Tensor, settings: FitSettings) -> HandFit:
-    problem = _problem(side, points, model, settings)
+def _fit_side(side: Side, points: np.ndarray, model: HandModel, betas: Tensor) -> HandFit:
+    problem = _problem(side, points, model, smooth=(NOISE_M / SHAKE_RAD) ** 2)
     pose = _initial_pose(problem)
-    for _ in range(settings.pose_steps):
+    for _ in range(POSE_STEPS):
         pose = pose_step(problem, pose, betas)
     error = (predict(problem.layer, pose, betas) - problem.keypoints).norm(dim=-1)
     error[problem.weights == 0] = torch.nan
@@ -117,7 +104,7 @@ def _fit_side(side: Side, points: np.ndarray, model: HandModel, betas: Tensor, s
     )
 
 
-def _problem(side: Side, points: np.ndarray, model: HandModel, settings: FitSettings) -> Problem:
+def _problem(side: Side, points: np.ndarray, model: HandModel, smooth: float) -> Problem:
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 3 or points.shape[1:] != (N_JOINTS, 3) or not len(points):
         raise BadInput(f"{side} hand keypoints", "an array (frame, 21, 3)", f"shape {points.shape}", "check the caller")
@@ -130,34 +117,33 @@ def _problem(side: Side, points: np.ndarray, model: HandModel, settings: FitSett
     return Problem(
         layer=kinematics_of(model, torch.float64),
         keypoints=torch.from_numpy(np.where(is_known[..., None], points, 0.0)),
-        weights=torch.from_numpy(is_known * np.asarray(settings.weights)),
+        weights=torch.from_numpy(is_known * np.asarray(WEIGHTS)),
         rest=torch.from_numpy(rest),
         prior_mean=torch.from_numpy(model.mean_pose.reshape(5, 9)),
-        prior=torch.from_numpy(pose_precision(rest, settings)),
-        smooth=(settings.noise_m / settings.shake_rad) ** 2,
+        prior=torch.from_numpy(pose_precision(rest)),
+        smooth=smooth,
     )
 
 
-def pose_precision(rest: np.ndarray, settings: FitSettings) -> np.ndarray:
+def pose_precision(rest: np.ndarray) -> np.ndarray:
     """Precision (5, 9, 9) of the prior of each finger's axis-angles, times the squared noise, in squared metres.
 
     The hinge axis is across the bone in the plane of the palm. A thumb bends about any axis across its bone.
 
     Args:
         rest: (21, 3) keypoints at rest.
-        settings: standard deviations.
     """
     palm_normal = _unit(np.cross(rest[1] - rest[0], rest[7] - rest[0]))
     precision = np.zeros((5, 9, 9))
     for finger, points in enumerate(FINGER_POINTS):
-        across = (settings.thumb_rad,) * 2 if finger == THUMB else (settings.bend_rad, settings.spread_rad)
+        across = (THUMB_RAD,) * 2 if finger == THUMB else (BEND_RAD, SPREAD_RAD)
         for joint in range(3):
             bone = _unit(rest[points[joint + 1]] - rest[points[joint]])
             hinge = _unit(np.cross(palm_normal, bone))
             axes = np.stack((hinge, np.cross(bone, hinge), bone))
             block = slice(3 * joint, 3 * joint + 3)
-            precision[finger, block, block] = axes.T @ np.diag(np.array([*across, settings.twist_rad]) ** -2.0) @ axes
-    return precision * settings.noise_m**2
+            precision[finger, block, block] = axes.T @ np.diag(np.array([*across, TWIST_RAD]) ** -2.0) @ axes
+    return precision * NOISE_M**2
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

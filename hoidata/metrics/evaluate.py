@@ -88,13 +88,11 @@ def evaluate_store(
     """Evaluate the store ``predicted`` against the annotated dataset ``reference``.
 
     Args:
-        predicted: folder of the predicted clips.
         reference: folder with clips, annotation, contact and splits (``load_annotated``).
         hands: the hand model of both, as in ``open_store``.
         split: the part of the chosen split whose clips are the references.
         encoders: their features are compared too.
         jobs: worker processes, used from ``WORKERS_PAY_FROM`` motions on; results do not depend on it.
-        progress: show a bar on stderr.
 
     Returns:
         The content of a metrics file:
@@ -128,39 +126,40 @@ def evaluate_store(
         target_distances=read_target_distances(predicted),
         actions=training_actions(annotated),
     )
-    jobs = jobs if sum(map(len, samples.values())) >= WORKERS_PAY_FROM else 1
-    result_by_id: dict[str, ClipResult] = {}
-    with Progress(console=Console(stderr=True), disable=not progress) as bar:
-        results = map_in_workers(evaluator.measure, clip_ids, jobs)
-        for clip_id, result in bar.track(results, len(clip_ids), description="evaluate"):
-            result_by_id[clip_id] = result
-    clips = [result_by_id[clip_id] for clip_id in clip_ids]
-    skipped += [item for clip in clips for item in clip.skipped]
-    measured = [clip for clip in clips if clip.samples]
+    results = _measured(evaluator, clip_ids, jobs, progress)
+    skipped += [item for clip_id in clip_ids for item in results[clip_id].skipped]
+    measured = {clip_id: results[clip_id] for clip_id in clip_ids if results[clip_id].samples}
     if not measured:
         got = f"{len(store)} clips, none of which can be compared"
         reason = f"; {skipped[0].clip_id}: {skipped[0].reason}" if skipped else ""
         remedy = "name predictions after their reference and store them in its world frame with its frames"
         raise BadInput(predicted, f"clips named <id>~<k> after the {split} clips of {reference}", got + reason, remedy)
-    summary = _summary(metrics, measured)
+    summary = _summary(metrics, list(measured.values()))
     if encoders:
         skipped_ids = {item.clip_id for item in skipped}
         compared = {
             clip_id: [(_number(sample, clip_id), sample) for sample in samples[clip_id] if sample not in skipped_ids]
-            for clip_id in clip_ids
-            if result_by_id[clip_id].samples
+            for clip_id in measured
         }
         of_features = encoder_summary(encoders, annotated, store, compared)
         summary = of_features | {name: summary[name] | of_features[name] for name in summary}
     return {
         "held_out_clips": len(clip_ids),
-        "motions": sum(len(clip.samples) for clip in measured),
+        "motions": sum(len(clip.samples) for clip in measured.values()),
         "synthetic": bool(annotated.store.sequences.loc[clip_ids, "synthetic"].any()),
         "length": "own" if evaluator.own_length else "given",
         **summary,
         "actions": evaluator.actions.facts,
         "left_out": [item._asdict() for item in skipped],
     }
+
+
+def _measured(evaluator: "_Evaluator", clip_ids: Sequence[str], jobs: int, progress: bool) -> dict[str, ClipResult]:
+    """The result of each reference clip by its id."""
+    jobs = jobs if sum(map(len, evaluator.samples.values())) >= WORKERS_PAY_FROM else 1
+    with Progress(console=Console(stderr=True), disable=not progress) as bar:
+        results = map_in_workers(evaluator.measure, clip_ids, jobs)
+        return dict(bar.track(results, len(clip_ids), description="evaluate"))
 
 
 def _summary(metrics: Sequence[Metric], measured: list[ClipResult]) -> dict[str, dict[str, Any]]:

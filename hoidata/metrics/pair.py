@@ -73,10 +73,6 @@ class Pair:
         """Indices of every n-th frame in which this hand is measured."""
         return np.flatnonzero(self.valid(side))[::frame_step]
 
-    def looked_at(self) -> np.ndarray:
-        """(frame,) bool: the frames in which any acting hand is measured."""
-        return np.any([self.valid(side) for side in self.sides], axis=0)
-
     def triples(self) -> np.ndarray:
         """(triple, 3) indices of three successive recorded frames with equal spacing."""
         recorded = np.flatnonzero(self._timed.recorded)

@@ -42,7 +42,6 @@ def distance_grid(tree: TriangleTree, solid: bool) -> DistanceGrid:
     """Compute a grid over a surface and 1 cm around it, with about as many cells as a cube of 64 x 64 x 64.
 
     Args:
-        tree: the surface's triangles.
         solid: the surface is closed, so distances inside are negative.
     """
     low, high = tree.box[0, :3] - MARGIN_M, tree.box[0, 3:] + MARGIN_M
@@ -158,7 +157,6 @@ def nearest_triangles(tree, points_m, distance_m, closest_m, triangle_of):  # pr
     """Find the closest surface point and its triangle.
 
     Args:
-        tree: the surface's triangles.
         points_m: (point, 3) query points.
         distance_m: (point,) exact distances from ``lower_distances``; points with an infinite distance are skipped.
         closest_m: (point, 3) output, on the surface.

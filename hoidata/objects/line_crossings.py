@@ -31,7 +31,6 @@ def intervals_inside(tree: TriangleTree, cell_m: float) -> Intervals:
     """Intersect a lattice of lines, centred on the bounding box, with the solid that a closed surface bounds.
 
     Args:
-        tree: the surface's triangles.
         cell_m: distance between lines.
     """
     low, high = tree.box[0, 1:3], tree.box[0, 4:]

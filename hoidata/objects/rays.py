@@ -21,7 +21,6 @@ def first_hits(tree, start_m, direction, reach_m, facing, hit_m):  # pragma: no 
     """Lower ``hit_m`` to the distance of each ray's first hit, if that is at most ``reach_m``.
 
     Args:
-        tree: the triangles.
         start_m: (ray, 3) origins.
         direction: (ray, 3) unit vectors.
         reach_m: (ray,) length of each ray.
@@ -199,7 +198,6 @@ def mark_cut_cubes(tree, centre_m, rotation, half_m, cut):  # pragma: no cover (
     """Set ``cut (cube,)`` for cubes that a triangle intersects or touches; marked cubes are skipped.
 
     Args:
-        tree: the triangles.
         centre_m: (cube, 3).
         rotation: (cube, 3, 3), columns are the directions of the edges.
         half_m: half an edge.

@@ -70,10 +70,8 @@ def read_urdf(path: Path, root: Path, moving: str, read_mesh: ReadMesh) -> UrdfO
     """Read the object of a URDF file.
 
     Args:
-        path: the URDF file.
         root: the folder that must contain all meshes; ``package://`` refers to it.
         moving: name of the joint that moves; "" if there is only one.
-        read_mesh: reads one mesh file.
 
     Raises:
         BadInput: the file is not a URDF, names a mesh outside of ``root``, or has several movable joints without

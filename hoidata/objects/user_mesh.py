@@ -26,7 +26,6 @@ UP_AXES = {
     sign + letter: np.eye(3)[axis] * float(f"{sign}1") for axis, letter in enumerate("xyz") for sign in ("", "-")
 }
 MERGE_PRECISION = 1e8  # vertices of STL and GLB are merged if they agree to 1 / this of the file's unit
-METRES_AND_Y_UP = (".glb",)  # by the glTF 2.0 specification
 GROUND_FRACTION = 1 / 50  # of the height: vertices below it are the footing
 CLOSING_TEST_RAD = 0.3  # hinge angle at which the direction of the hinge is tested
 CLOSING_FRACTION = 0.01  # a hinge closes if the parts' centres approach by this fraction
@@ -53,7 +52,6 @@ def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "", 
     """Read an object from an OBJ, PLY, STL, GLB or URDF file, or from a folder with a URDF file.
 
     Args:
-        path: the file or folder.
         unit: "m", "cm", "mm", "dm" or "inch"; metres by default.
         up: the file's axis that points up, such as "z" or "-y"; guessed by default (GLB: y, URDF: z).
         hinge: of a mesh file "px,py,pz dx,dy,dz", a point on the axis and its direction in the file's unit and axes; or
@@ -113,7 +111,7 @@ def _body(path: Path, hinge: str, moving: str) -> UrdfObject:
 def _usual_up(path: Path) -> tuple[str, str] | None:
     if find_urdf(path):
         return "z", "z is up, as usual in URDF files"
-    return ("y", "y is up, as in every GLB file") if _is_gltf(path) else None
+    return ("y", "y is up, as in every GLB file") if path.suffix.lower() == ".glb" else None  # by the specification
 
 
 def closes(model: ObjectModel) -> bool:
@@ -308,10 +306,6 @@ def _merged_within_source(file: _MeshFile) -> np.ndarray:
     if file.source is None:
         return np.arange(len(file.mesh.vertices))
     return distinct_rows(np.column_stack((np.round(file.mesh.vertices * MERGE_PRECISION), file.source))).number
-
-
-def _is_gltf(path: Path) -> bool:
-    return path.suffix.lower() in METRES_AND_Y_UP
 
 
 def _scale(path: Path, mesh: Mesh, unit: str) -> float:

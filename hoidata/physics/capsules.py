@@ -78,12 +78,10 @@ def joined(hands: list[Capsules]) -> Capsules:
     return Capsules(np.concatenate(starts, axis=1), np.concatenate(ends, axis=1), np.concatenate(radii))
 
 
-def capsule_contacts(
-    model: ObjectModel, poses: ObjectPoses, capsules: Capsules, tolerance_m: float = 0.0
-) -> CapsuleContacts:
-    """Find capsules within ``tolerance_m`` of the object; of a hinged object's parts, the deepest contact counts."""
+def capsule_contacts(model: ObjectModel, poses: ObjectPoses, capsules: Capsules) -> CapsuleContacts:
+    """Find capsules that overlap the object; of a hinged object's parts, the deepest contact counts."""
     contacts_of_parts = [
-        _part_contacts(model, part, poses.world_from_part(model, part), capsules, tolerance_m) for part in model.parts
+        _part_contacts(model, part, poses.world_from_part(model, part), capsules) for part in model.parts
     ]
     contacts = CapsuleContacts(*(np.concatenate(column) for column in zip(*contacts_of_parts, strict=True)))
     # Of the contacts of a capsule with both parts, keep the deepest: the first after sorting.
@@ -94,19 +92,19 @@ def capsule_contacts(
 
 
 def _part_contacts(
-    model: ObjectModel, part: int, world_from_part: RigidTransform, capsules: Capsules, tolerance_m: float
+    model: ObjectModel, part: int, world_from_part: RigidTransform, capsules: Capsules
 ) -> CapsuleContacts:
     surface = surface_index(model).filled[part]
     start, end = (world_from_part.inverse() @ ends for ends in (capsules.start_m, capsules.end_m))
-    frame, capsule = _candidates(surface.tree.box[0], start, end, capsules.radius_m + tolerance_m)
+    frame, capsule = _candidates(surface.tree.box[0], start, end, capsules.radius_m)
     start, end, radius = start[frame, capsule], end[frame, capsule], capsules.radius_m[capsule]
     half = np.linalg.norm(end - start, axis=1) / 2
     middle = surface.nearest((start + end) / 2)
-    near = middle.distance_m < half + radius + tolerance_m  # the distance is 1-Lipschitz along the axis
+    near = middle.distance_m < half + radius  # the distance is 1-Lipschitz along the axis
     frame, capsule, start, end, radius = (column[near] for column in (frame, capsule, start, end, radius))
     along = _deepest(surface, start, end)
     deepest = surface.nearest(start + along[:, None] * (end - start))
-    hit = deepest.distance_m < radius + tolerance_m
+    hit = deepest.distance_m < radius
     frame, world = frame[hit], world_from_part[frame[hit]]
     surface_points = deepest.closest_m[hit], deepest.normal[hit], middle.closest_m[near][hit], middle.normal[near][hit]
     point, normal, middle_point, middle_normal = (

@@ -74,8 +74,6 @@ def required_wrench(motion: BodyMotion, fps: float, gravity: np.ndarray) -> np.n
     """Wrench that contacts must apply to a body of 1 kg, by central differences over frames.
 
     Args:
-        motion: of the body.
-        fps: frames per second.
         gravity: (3,) unit vector, downwards.
 
     Returns:
@@ -114,7 +112,6 @@ def patch_contacts(distances: SignedDistance, patches: np.ndarray, frame: int) -
     Args:
         distances: of points (frame, point), object frame, from ``SurfaceIndex.nearest``.
         patches: (point,) labels, such as those of :func:`hand_patches`.
-        frame: index of the frame.
 
     Returns:
         The closest surface points and their normals.

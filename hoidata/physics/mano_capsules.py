@@ -13,7 +13,6 @@ from hoidata.hands import PARENTS, TIP_VERTICES, HandModel, HandTrackLike, track
 from hoidata.physics.capsules import Capsules
 
 N_CAPSULES = 19
-THUMB_CAPSULES = (16, 17, 18)
 _KNUCKLES = (1, 4, 7, 10)
 _PALM_START = 0.25  # fraction of the distance from the wrist to a knuckle
 _SEGMENT_RANGE = (0.2, 0.9)  # part of a segment's axis whose skin is used, without the folds at the joints

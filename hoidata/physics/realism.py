@@ -5,10 +5,9 @@ units of ManipNet's release.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from scipy.optimize import nnls
@@ -20,15 +19,13 @@ from hoidata.physics.scene import Scene
 
 LARGEST_PENETRATION_M = 0.015
 SMOOTHNESS_FPS = 60.0
-SUPPORT_M = 0.002
 MAX_STEPS = 300
 RELEASED_UNITS_PER_METRE = 10.0
 RELEASED_GRAVITY_PER_S = 9.8
 RELEASED_STEPS = 100
-_SUPPORT_DIRECTIONS = 16
+RELEASED_FRICTION = 0.35
 
 
-@dataclass(frozen=True)
 class StandardUnits:
     """ManipNet's Appendix A in SI units: do contact forces explain the motion?
 
@@ -36,21 +33,13 @@ class StandardUnits:
     frame passes if the norm of its residual wrench is below the limit.
     """
 
-    friction: float = FRICTION  # Coulomb's coefficient
-    limit: float = RESIDUAL_LIMIT  # of the residual's norm, N and N m
-    tolerance_m: float = 0.0  # a capsule within this distance is a contact
-    table_m: float | None = None  # height of a table that also supports the object
+    limit: ClassVar[float] = RESIDUAL_LIMIT  # of the residual's norm, N and N m
     at_centre: ClassVar[bool] = False
 
     def residuals(self, scene: Scene, contacts: CapsuleContacts) -> np.ndarray:
         """(frame,) norm of the residual wrench after the best contact forces."""
-        frame, point, normal = contacts.frame, contacts.point_m, contacts.normal
-        if self.table_m is not None:
-            table_frame, table_point = table_contacts(scene, self.table_m)
-            frame, point = np.concatenate([frame, table_frame]), np.concatenate([point, table_point])
-            normal = np.concatenate([normal, np.broadcast_to(scene.gravity, (len(table_frame), 3))])
-        arms = point - scene.motion.centre_m[frame]
-        columns, offsets = force_columns(frame, arms, cone_edges(normal, self.friction), scene.n_frames)
+        arms = contacts.point_m - scene.motion.centre_m[contacts.frame]
+        columns, offsets = force_columns(contacts.frame, arms, cone_edges(contacts.normal, FRICTION), scene.n_frames)
         return np.linalg.norm(wrench_residuals(columns, offsets, scene.wrench), axis=1)
 
 
@@ -63,7 +52,6 @@ def force_columns(
         frame: (contact,) index of the contact's frame.
         arms: (contact, 3) from the reference point to the contact.
         edges: (contact, edge, 3).
-        n_frames: of the scene.
 
     Returns:
         Columns (6, n) sorted by frame, and offsets (frame + 1,) of each frame's first column.
@@ -86,7 +74,6 @@ def wrench_residuals(
         columns: (6, column) of all frames; frame i has ``columns[:, offsets[i] : offsets[i + 1]]``, maybe none.
         offsets: (frame + 1,).
         wrenches: (frame, 6). Force and torque may have any units, which the norm mixes.
-        max_steps: limit of the solver.
 
     Returns:
         (frame, 6).
@@ -108,33 +95,12 @@ def wrench_residuals(
     return residuals
 
 
-def table_contacts(scene: Scene, table_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Frames (contact,) and world points (contact, 3) of contacts between the object and a table top.
-
-    Contacts are vertices within 2 mm of the table, at most the extreme ones in 16 directions.
-    """
-    # Edges of a cone with friction 1 minus its axis: two pairs of opposite tangents of the table.
-    tangents = cone_edges(scene.gravity[None], 1.0)[0] + scene.gravity
-    angles = np.arange(_SUPPORT_DIRECTIONS) * (2 * np.pi / _SUPPORT_DIRECTIONS)
-    directions = np.cos(angles)[:, None] * tangents[0] + np.sin(angles)[:, None] * tangents[2]
-    frames, points = [], []
-    for frame in np.flatnonzero(np.abs(scene.lowest_m - table_m) < SUPPORT_M):
-        vertices = scene.vertices_m(slice(frame, frame + 1))[0]
-        touching = vertices[np.abs(-vertices @ scene.gravity - table_m) < SUPPORT_M]
-        outer = touching[np.unique((touching @ directions.T).argmax(axis=0))]
-        frames.append(np.full(len(outer), frame))
-        points.append(outer)
-    if not frames:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-    return np.concatenate(frames), np.concatenate(points)
-
-
-@dataclass(frozen=True)
 class AsReleased:
     """The units of ManipNet's released sources, for comparison with the paper's results.
 
     Gravity is ten times too small for lengths in decimetres, so part of a motion passes without any contact. The driver
-    of the evaluation is not public.
+    of the evaluation is not public. The moving point, and reference of torques, is the centre of mass of the paper's
+    Eq. 9; in the sources it is the object's origin, up to 10 cm away in the released meshes.
 
     - Lengths are in dm.
     - Velocity is a forward difference per second; acceleration is its difference per frame, not divided by the frame
@@ -145,26 +111,20 @@ class AsReleased:
     - The solver takes at most 100 steps. A frame passes if the mean of the six squared residuals is below 0.01.
     """
 
-    friction: float = 0.35
-    limit: float = 0.01
-    tolerance_m: float = 0.0
-    # The moving point, and reference of torques: the object's origin in the sources, the centre of mass in the paper's
-    # Eq. 9. They differ by up to 10 cm in the released meshes.
-    reference: Literal["centre of mass", "origin"] = "centre of mass"
+    limit: ClassVar[float] = 0.01
     at_centre: ClassVar[bool] = True
 
     def residuals(self, scene: Scene, contacts: CapsuleContacts) -> np.ndarray:
         """(frame,) mean of the six squared residuals."""
-        centre = scene.motion.centre_m if self.reference == "centre of mass" else scene.poses.translation_m
-        edges = friction_edges(contacts.normal, self.friction)
-        arms = (contacts.point_m - centre[contacts.frame]) * RELEASED_UNITS_PER_METRE
+        edges = friction_edges(contacts.normal)
+        arms = (contacts.point_m - scene.motion.centre_m[contacts.frame]) * RELEASED_UNITS_PER_METRE
         columns, offsets = force_columns(contacts.frame, arms, edges, scene.n_frames)
-        return np.square(wrench_residuals(columns, offsets, self.wrench(scene, centre), RELEASED_STEPS)).mean(axis=1)
+        return np.square(wrench_residuals(columns, offsets, self.wrench(scene), RELEASED_STEPS)).mean(axis=1)
 
-    def wrench(self, scene: Scene, centre_m: np.ndarray) -> np.ndarray:
+    def wrench(self, scene: Scene) -> np.ndarray:
         """(frame, 6) change of momentum per frame minus gravity; the last frames repeat the previous value."""
         step_s = 1 / scene.fps
-        velocity = _forward(centre_m * RELEASED_UNITS_PER_METRE) / step_s
+        velocity = _forward(scene.motion.centre_m * RELEASED_UNITS_PER_METRE) / step_s
         rotmats, inertia = scene.poses.rotmats, scene.motion.inertia_kg_m2 * RELEASED_UNITS_PER_METRE**2
         spin_steps = Rotation.from_matrix(rotmats[:-1].transpose(0, 2, 1) @ rotmats[1:]).as_rotvec() / step_s
         spin = np.concatenate([spin_steps, spin_steps[-1:]])
@@ -174,7 +134,7 @@ class AsReleased:
         return np.concatenate([force, torque], axis=1)
 
 
-def friction_edges(normals: np.ndarray, friction: float) -> np.ndarray:
+def friction_edges(normals: np.ndarray) -> np.ndarray:
     """(contact, 4, 3) edges (+-1, 1/mu, 0) and (0, 1/mu, +-1), with the second axis rotated to the inward normal."""
     inward = -normals
     along = inward[:, 1].clip(-1 + 1e-9)
@@ -182,7 +142,7 @@ def friction_edges(normals: np.ndarray, friction: float) -> np.ndarray:
     # Columns of the smallest rotation that takes (0, 1, 0) to the inward normal.
     first = np.stack([1 - x * x / (1 + along), -x, -x * z / (1 + along)], axis=1)
     third = np.stack([-x * z / (1 + along), -z, 1 - z * z / (1 + along)], axis=1)
-    push = inward / friction
+    push = inward / RELEASED_FRICTION
     return np.stack([first + push, -first + push, third + push, -third + push], axis=1)
 
 
@@ -213,12 +173,10 @@ def score(scene: Scene, variant: Variant, frames: np.ndarray | None = None) -> R
     """Score the physical realism of a scene of at least 3 frames.
 
     Args:
-        scene: the motion.
-        variant: how to compute residuals.
         frames: (frame,) bool, the frames to select; ``scene.lifted`` by default.
     """
     frames = scene.lifted if frames is None else frames
-    selected, touching = np.flatnonzero(frames), contacts_in(scene, frames, variant.tolerance_m)
+    selected, touching = np.flatnonzero(frames), contacts_in(scene, frames)
     contacts = touching.at_middle() if variant.at_centre else touching
     penetration = np.full(scene.n_frames, np.nan)
     penetration[selected] = 0.0
@@ -236,18 +194,18 @@ def score(scene: Scene, variant: Variant, frames: np.ndarray | None = None) -> R
     )
 
 
-def contacts_in(scene: Scene, frames: np.ndarray, tolerance_m: float = 0.0) -> CapsuleContacts:
+def contacts_in(scene: Scene, frames: np.ndarray) -> CapsuleContacts:
     """Capsule contacts in frames (frame,) bool, with the scene's frame indices; cached."""
     selected = np.flatnonzero(frames)
-    contacts = _cached_contacts(scene, selected.tobytes(), tolerance_m)
+    contacts = _cached_contacts(scene, selected.tobytes())
     return contacts._replace(frame=selected[contacts.frame])
 
 
 @lru_cache(maxsize=2)
-def _cached_contacts(scene: Scene, selected: bytes, tolerance_m: float) -> CapsuleContacts:
+def _cached_contacts(scene: Scene, selected: bytes) -> CapsuleContacts:
     """Contacts in some frames (int64 indices as bytes), cached because all variants need them."""
     frames = np.frombuffer(selected, np.int64)
-    return capsule_contacts(scene.model, scene.poses.taken(frames), scene.capsules.taken(frames), tolerance_m)
+    return capsule_contacts(scene.model, scene.poses.taken(frames), scene.capsules.taken(frames))
 
 
 VARIANTS: Mapping[str, Variant] = MappingProxyType({"SI": StandardUnits(), "as released": AsReleased()})
@@ -261,7 +219,6 @@ def smoothness_m_s2(joints_m: np.ndarray, wrist_rotmats: np.ndarray, fps: float)
     Args:
         joints_m: (frame, joint, 3) world, the wrist first, NaN without the hand.
         wrist_rotmats: (frame, 3, 3) world_from_wrist.
-        fps: frames per second.
 
     Raises:
         ValueError: the hand has fewer than three successive frames.

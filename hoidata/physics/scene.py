@@ -9,7 +9,7 @@ from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack
 from hoidata.errors import BadInput
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import HandModel, HandPair
-from hoidata.objects.model import ObjectModel, articulate
+from hoidata.objects.model import ObjectModel
 from hoidata.physics.capsules import Capsules, ObjectPoses, joined
 from hoidata.physics.contact_forces import GRAVITY_M_S2, BodyMotion, body_motion, required_wrench
 from hoidata.physics.mano_capsules import hand_capsules
@@ -46,12 +46,6 @@ class Scene:
     def wrench(self) -> np.ndarray:
         """(frame, 6) N and N m about the centre of mass, the required wrench of hands and table together."""
         return required_wrench(self.motion, self.fps, self.gravity)
-
-    def vertices_m(self, frames: slice) -> np.ndarray:
-        """(selected frame, vertex, 3) object vertices in the world; those of all frames may take gigabytes."""
-        model, poses = self.model, self.poses.taken(frames)
-        local = articulate(model.vertices_m, model.part, model.hinge, poses.hinge_rad)
-        return poses.world_from_part(model, 0) @ local
 
     @cached_property
     def lowest_m(self) -> np.ndarray:

@@ -25,8 +25,6 @@ def minimize_banded(
     """Minimise a least-squares cost by Levenberg-Marquardt with one damping for all frames.
 
     Args:
-        start: initial state.
-        cost: cost of a state.
         equations: blocks and vector of the normal equations at a state, as ``solve_damped`` takes them.
         stepped: the state after a step (frame or control point, unknown).
         max_steps: largest number of accepted steps.

@@ -7,14 +7,13 @@ import numpy as np
 
 from hoidata.clips.clip import SIDES, HandTrack
 from hoidata.errors import BadInput
-from hoidata.hands.fitting import FitSettings, pose_precision
+from hoidata.hands.fitting import NOISE_M, pose_precision
 from hoidata.hands.model import N_SHAPE, TIP_VERTICES, HandModel, HandPair, Side
 from hoidata.refinement.skin import HandPose, SkinnedHand
 
 STEPS = 20
 SHAPE_STEPS, SHAPE_FRAMES = 12, 48  # most steps of the shape fit; most frames, evenly spaced, that determine a shape
 SHAPE_PRECISION = 0.3  # of the shape's zero-mean normal prior, per frame: errors of keypoints are alike in all frames
-NOISE_M = 0.003  # standard deviation of a keypoint
 PALM_WEIGHT = 0.5  # a vertex whose skin weight of the wrist is larger belongs to the palm
 MIN_DAMPING, MAX_DAMPING = 1e-8, 1e8
 MIN_GAIN = 1e-4  # the shape fit stops when a step reduces the cost by less than this fraction
@@ -44,10 +43,8 @@ def fit_hands(
     """Fit hand poses to generated keypoints, each frame by itself, after one shape per hand over all frames.
 
     Args:
-        pair: hand models of both sides.
         betas: (2, 10) shapes of the left and the right hand if they are known; None: fitted.
         keypoint_ids: (keypoint,) vertices, the same on both sides.
-        generated: keypoints of each hand.
         template_m: (2, 778, 3) personal rest meshes instead of the models' templates; not used if shapes are fitted.
 
     Returns:
@@ -94,9 +91,8 @@ def check_generated(
 def pose_prior(model: HandModel) -> tuple[np.ndarray, np.ndarray]:
     """Mean (45,) and precision (45, 45) of the Gaussian prior of the finger axis-angles, in radians."""
     rest = np.concatenate((model.rest_joints_m(np.zeros(10)), model.template_m[list(TIP_VERTICES)]))
-    settings = FitSettings()
     precision = np.zeros((45, 45))
-    for finger, block in enumerate(pose_precision(rest, settings) / settings.noise_m**2):
+    for finger, block in enumerate(pose_precision(rest) / NOISE_M**2):
         precision[9 * finger : 9 * finger + 9, 9 * finger : 9 * finger + 9] = block
     return model.mean_pose, precision
 

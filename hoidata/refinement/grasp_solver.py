@@ -6,7 +6,6 @@ Levenberg-Marquardt.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -22,37 +21,27 @@ from hoidata.refinement.skin import HandPose, SkinnedHand
 _LEVER_M = np.concatenate((np.ones(3), np.full(3, 0.1), np.full(45, 0.04)))
 GRASP_FRAMES = 6  # that represent a grasp
 _METRIC_VERTICES = 16  # the deviation of a pose from the original counts as that of 16 vertices
+PRESS_M = 0.0015  # depth of touching skin, since skin is soft
+CLEAR_M = 0.012  # distance that a grasping hand keeps from a part that moves past it
+REACH_M = 0.003  # skin farther from the surface is hardly attracted (Gaussian weight)
+
+# Standard deviations of the residuals; a smaller one counts more.
+SURFACE_M = 0.001  # of the nearest skin of each of 16 segments of a grasping hand, from PRESS_M
+DEPTH_M = 0.0005  # of a vertex deeper than PRESS_M in the object or in the other hand
+CLEAR_DEVIATION_M = 0.004  # of a vertex closer than CLEAR_M
+KEYPOINT_M = 0.006  # of a vertex from its original position
+BEND_M = 0.004  # of a control point from the mean of its neighbours
+FINGER_RAD = 0.1  # of a finger angle from the original; without it, impossible poses bring distant skin to the surface
+
+KNOT_FRAMES = 5  # frames between knots of the spline
+EVERY = 2  # outside of grasps one of so many frames is evaluated
+STEPS = 12  # largest number of steps
+MIN_GAIN = 0.01  # stop when a step reduces the cost by less than this fraction
 
 
-@dataclass(frozen=True)
-class SolverSettings:
-    """Standard deviations of the residuals (a smaller one counts more), and how the motion is sampled."""
-
-    press_m: float = 0.0015  # depth of touching skin, since skin is soft
-    surface_m: float = 0.001  # of the nearest skin of each of 16 segments of a grasping hand, from that depth
-    depth_m: float = 0.0005  # of a vertex deeper than press_m in the object or in the other hand
-    bend_m: float = 0.004  # of a control point from the mean of its neighbours
-    # Of each finger angle from the original. Without it, distant skin is attracted by impossible finger poses.
-    finger_rad: float = 0.1
-    clear_m: float = 0.012  # distance that a grasping hand keeps from a part that moves past it
-    clear_deviation_m: float = 0.004  # of a vertex closer than that
-    knot_frames: int = 5  # frames between knots of the spline
-    every: int = 2  # outside of grasps one of so many frames is evaluated
-    steps: int = 12  # largest number of steps
-    enough: float = 0.01  # stop when a step reduces the cost by less than this fraction
-
-
-@dataclass(frozen=True)
-class Attraction:
-    """How strongly skin near the surface is attracted to it."""
-
-    reach_m: float = 0.003  # skin farther away is hardly attracted (Gaussian weight)
-    keypoint_m: float = 0.006  # standard deviation of a vertex from its original position
-
-
-def spline_weights(n_frames: int, grasps: Sequence[Interval], knot_frames: int) -> np.ndarray:
+def spline_weights(n_frames: int, grasps: Sequence[Interval]) -> np.ndarray:
     """(frame, control point) weights that sum to 1; the control points that influence a grasp are one."""
-    intervals = max(1, round((n_frames - 1) / knot_frames))
+    intervals = max(1, round((n_frames - 1) / KNOT_FRAMES))
     first = np.minimum(np.linspace(0, intervals, n_frames).astype(int), intervals - 1)
     u = np.linspace(0, intervals, n_frames) - first
     basis = np.stack(((1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3), 1) / 6
@@ -85,15 +74,10 @@ class GraspObjective:
     """Cost of a hand's pose in each frame, and its normal equations; everything in the frame of the part.
 
     Args:
-        skin: the hand's vertices.
-        field: distances to the object.
         original: (frame,) pose before the correction.
         frames: (frame,) index of each frame in the object's motion.
         in_grasp: (frame,) bool.
         other: (frame,) capsules of the other hand, if any.
-        settings: standard deviations.
-        attraction: how far skin is attracted.
-        part: the part that the hand grasps.
         passed: (frame,) bool, the other part moves past the hand; None for never.
     """
 
@@ -105,19 +89,16 @@ class GraspObjective:
         frames: np.ndarray,
         in_grasp: np.ndarray,
         other: Capsules | None,
-        settings: SolverSettings,
-        attraction: Attraction,
         part: int = 0,
         passed: np.ndarray | None = None,
     ) -> None:
         self.skin, self.field, self.original, self.frames = skin, field, original, frames
         self.other, self.part, self.passed = other, part, passed
-        self.settings, self.attraction = settings, attraction
         self.metric = self._metric()
         self.start = self.evaluate(np.zeros((len(frames), N_UNKNOWNS)))
         near = np.maximum(skin.nearest_of_segments(self.start.grasped_m)[1], 0)
         # (frame, segment) how certain it is that the segment touches.
-        self.touch_weight = np.exp(-0.5 * (near / attraction.reach_m) ** 2) * in_grasp[:, None]
+        self.touch_weight = np.exp(-0.5 * (near / REACH_M) ** 2) * in_grasp[:, None]
 
     def _metric(self) -> np.ndarray:
         """(frame, 51, 51) quadratic form of a step: squared vertex displacements in standard deviations."""
@@ -128,9 +109,9 @@ class GraspObjective:
         derivative = derivative.reshape(len(self.frames), -1, N_UNKNOWNS)
         # A little of each unknown is added, since some fingers move few of the vertices.
         metric = derivative.swapaxes(1, 2) @ derivative / len(vertex) + 1e-5 * np.eye(N_UNKNOWNS)
-        metric *= _METRIC_VERTICES / self.attraction.keypoint_m**2
+        metric *= _METRIC_VERTICES / KEYPOINT_M**2
         fingers = np.arange(6, N_UNKNOWNS)
-        metric[:, fingers, fingers] += self.settings.finger_rad**-2
+        metric[:, fingers, fingers] += FINGER_RAD**-2
         return metric
 
     def evaluate(self, step: np.ndarray) -> EvaluatedPose:
@@ -157,21 +138,19 @@ class GraspObjective:
 
     def costs(self, state: EvaluatedPose) -> np.ndarray:
         """(frame,) cost of a pose."""
-        settings, step = self.settings, state.step
-        costs = ((self.metric @ step[..., None])[..., 0] * step).sum(axis=1)
-        to_touch = self.skin.nearest_of_segments(state.grasped_m)[1] + settings.press_m
-        costs += (self.touch_weight * to_touch**2).sum(axis=1) / settings.surface_m**2
+        costs = ((self.metric @ state.step[..., None])[..., 0] * state.step).sum(axis=1)
+        to_touch = self.skin.nearest_of_segments(state.grasped_m)[1] + PRESS_M
+        costs += (self.touch_weight * to_touch**2).sum(axis=1) / SURFACE_M**2
         for distance, _, least_m, deviation_m in self._obstacles(state):
             costs += (np.minimum(distance - least_m, 0) ** 2).sum(axis=1) / deviation_m**2
         return costs
 
     def _obstacles(self, state: EvaluatedPose) -> list[tuple[np.ndarray, np.ndarray, float, float]]:
         """Per obstacle: distances, gradients, least allowed distance and standard deviation, metres."""
-        settings = self.settings
         return [
-            (state.distance_m, state.slope, -settings.press_m, settings.depth_m),
-            (state.other_m, state.other_slope, -settings.press_m, settings.depth_m),
-            (state.passing_m, state.passing_slope, settings.clear_m, settings.clear_deviation_m),
+            (state.distance_m, state.slope, -PRESS_M, DEPTH_M),
+            (state.other_m, state.other_slope, -PRESS_M, DEPTH_M),
+            (state.passing_m, state.passing_slope, CLEAR_M, CLEAR_DEVIATION_M),
         ]
 
     def equations(self, state: EvaluatedPose) -> tuple[np.ndarray, np.ndarray]:
@@ -184,12 +163,12 @@ class GraspObjective:
 
     def _add_distances(self, state: EvaluatedPose, matrix: np.ndarray, vector: np.ndarray) -> None:
         """Add the residuals of skin that should touch, and of skin beyond the least distance of an obstacle."""
-        settings, chain = self.settings, self.skin.chain(state.pose, slopes=True)
+        chain = self.skin.chain(state.pose, slopes=True)
         nearest_vertex, near = self.skin.nearest_of_segments(state.grasped_m)
         frame, segment = np.nonzero(self.touch_weight > 1e-3)
         vertex = nearest_vertex[frame, segment]
-        weight = self.touch_weight[frame, segment] / settings.surface_m**2
-        residuals = [(frame, vertex, near[frame, segment] + settings.press_m, weight)]
+        weight = self.touch_weight[frame, segment] / SURFACE_M**2
+        residuals = [(frame, vertex, near[frame, segment] + PRESS_M, weight)]
         slopes = [state.grasped_slope[frame, vertex]]
         for distance, slope, least_m, deviation_m in self._obstacles(state):
             frame, vertex = np.nonzero(distance < least_m)
@@ -220,17 +199,15 @@ class HandMotion:
         grasps: Sequence[Interval],
         valid: np.ndarray,
         other: Capsules | None,
-        settings: SolverSettings = SolverSettings(),
-        attraction: Attraction = Attraction(),
         part: int = 0,
         passed: np.ndarray | None = None,
     ) -> None:
-        self.pose, self.settings = pose, settings
-        self.all_weights = spline_weights(len(valid), grasps, settings.knot_frames)
-        frames, self.frame_weight, in_grasp = _representative_frames(grasps, valid, settings.every)
+        self.pose = pose
+        self.all_weights = spline_weights(len(valid), grasps)
+        frames, self.frame_weight, in_grasp = _representative_frames(grasps, valid)
         self.weights = self.all_weights[frames]
         bend = np.diff(np.eye(self.weights.shape[1]), n=2, axis=0)
-        self.bend = bend.T @ bend / settings.bend_m**2  # of the control points' second differences
+        self.bend = bend.T @ bend / BEND_M**2  # of the control points' second differences
         self.objective = GraspObjective(
             skin,
             field,
@@ -238,8 +215,6 @@ class HandMotion:
             frames,
             in_grasp=in_grasp,
             other=None if other is None else other.taken(frames),
-            settings=settings,
-            attraction=attraction,
             part=part,
             passed=None if passed is None else passed[frames],
         )
@@ -253,7 +228,7 @@ class HandMotion:
 
         start = self.objective.start, np.zeros((self.weights.shape[1], N_UNKNOWNS))
         _, control_points = minimize_banded(
-            start, self._cost, self._equations, stepped, max_steps=self.settings.steps, min_gain=self.settings.enough
+            start, self._cost, self._equations, stepped, max_steps=STEPS, min_gain=MIN_GAIN
         )
         return self.pose.moved(self.all_weights @ control_points)
 
@@ -276,18 +251,13 @@ class HandMotion:
         return blocks, gradient - self.bend @ control_points * _LEVER_M**2
 
 
-def _representative_frames(
-    grasps: Sequence[Interval], valid: np.ndarray, frame_step: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Frames to evaluate, how many frames each represents, and whether it is in a grasp.
-
-    frame_step: outside of grasps one of so many frames is evaluated.
-    """
+def _representative_frames(grasps: Sequence[Interval], valid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Frames to evaluate, how many frames each represents, and whether it is in a grasp."""
     weight, in_grasp = np.zeros(len(valid)), np.zeros(len(valid), bool)
     for start, stop in grasps:
         in_grasp[start:stop] = True
         middles = ((np.arange(GRASP_FRAMES) + 0.5) * (stop - start) / GRASP_FRAMES).astype(int)
         weight[start + middles] = (stop - start) / GRASP_FRAMES
-    weight[np.flatnonzero(~in_grasp & valid)[frame_step // 2 :: frame_step]] = frame_step
+    weight[np.flatnonzero(~in_grasp & valid)[EVERY // 2 :: EVERY]] = EVERY
     frames = np.flatnonzero(weight)
     return frames, weight[frames], in_grasp[frames]

@@ -23,15 +23,6 @@ class ObjectField:
             (surface.grid, _contiguous(world_from_part(track, part).inverse())) for part, surface in surfaces.items()
         ]
 
-    @property
-    def moves(self) -> bool:
-        """Whether the object is articulated."""
-        return len(self._parts) > 1
-
-    def nearest_part(self, points_m: np.ndarray) -> np.ndarray:
-        """(frame, point) index of the part with the smallest distance to points (frame, point, 3), world."""
-        return np.argmin([self.distances_to(part, points_m)[0] for part in range(len(self._parts))], axis=0)
-
     def part_touched(self, points_m: np.ndarray, touching: np.ndarray) -> tuple[int, np.ndarray]:
         """The part that most points touch, and which points touch it.
 
@@ -42,9 +33,9 @@ class ObjectField:
         Returns:
             Index of the part, and (frame, point) bool, whether a point touches it.
         """
-        if not self.moves:
+        if len(self._parts) == 1:
             return 0, touching
-        nearest = self.nearest_part(points_m)
+        nearest = np.argmin([self.distances_to(part, points_m)[0] for part in (0, 1)], axis=0)
         by_part = [touching & (nearest == number) for number in (0, 1)]
         part = int(by_part[1].sum() > by_part[0].sum())
         return part, by_part[part]

@@ -49,12 +49,10 @@ def refine_hands(
     """Refine fitted hands against the object; shapes are unchanged.
 
     Args:
-        pair: hand models of both sides.
         keypoint_ids: as in ``fit_hands``.
         generated: as in ``fit_hands``.
         tracks: the start, as returned by ``fit_hands``.
         object_track: the object's motion, with equally many frames.
-        settings: standard deviations and stopping criteria.
 
     Raises:
         BadInput: arrays of inconsistent shapes or lengths.

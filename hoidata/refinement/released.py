@@ -60,7 +60,6 @@ def energy_terms(
         present: (frame, hand) bool, frames that have the hand.
         ids: (keypoint,) vertices.
         to_object_m: (frame, hand, keypoint, 3) generated vectors from the keypoints to the object.
-        surface: the object.
     """
 
     def squares(points_m: Tensor, mask: np.ndarray) -> Tensor:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from hoidata.clips.clip import HandTrack
-from hoidata.geometry.rotations import nearest_rotvec, rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.model import N_ROTATIONS, PARENTS, HandModel
 from hoidata.hands.solver import left_jacobian
@@ -36,12 +36,6 @@ class HandPose(NamedTuple):
     def taken(self, frames: np.ndarray) -> "HandPose":
         """The poses of the chosen frames."""
         return HandPose(*(array[frames] for array in self))
-
-    def step_to(self, other: "HandPose") -> np.ndarray:
-        """(frame, 51) the step from this pose to the other one; finger angles go the shorter way."""
-        rotation = rotmat_to_rotvec(other.orient @ self.orient.swapaxes(-1, -2))
-        fingers = (nearest_rotvec(other.fingers, self.fingers) - self.fingers).reshape(len(rotation), -1)
-        return np.concatenate((other.wrist_m - self.wrist_m, rotation, fingers), 1)
 
     def relative_to(self, a_from_world: RigidTransform) -> "HandPose":
         """The same hand in frame of reference a; ``a_from_world``: (frame,) transforms."""
@@ -83,7 +77,6 @@ class SkinnedHand:
     """Vertices of a hand model with a fixed shape.
 
     Args:
-        model: one side of a hand model.
         betas: (10,) shape coefficients.
         template_m: (778, 3) personal rest mesh instead of the model's template.
         ids: (vertex,) which vertices, all by default.

@@ -139,7 +139,6 @@ class Denoiser(nn.Module):
         Args:
             x: (B, F, D) noised, normalised values.
             steps: (B,) diffusion steps, 0 to 999.
-            windows: the condition.
             drop: (B,) bool, windows whose contact map is dropped.
 
         Returns:
@@ -307,12 +306,16 @@ class SceneWindow:
     active_hands: np.ndarray  # (2,) bool
 
 
+def padded(windows: Sequence[np.ndarray], length: int) -> Tensor:
+    """(window, length, D) float32 rows of windows (frame, D), with zeros after their last frame."""
+    rows = [
+        np.concatenate((window, np.zeros((length - len(window), window.shape[1]), window.dtype))) for window in windows
+    ]
+    return torch.from_numpy(np.stack(rows).astype(np.float32))
+
+
 def build_windows(scene_windows: Sequence[SceneWindow], length: int, config: DenoiserConfig) -> Windows:
     """The condition of windows, padded to ``length`` frames, without contact maps."""
-
-    def padded(rows: np.ndarray) -> np.ndarray:
-        return np.concatenate((rows, np.zeros((length - len(rows), *rows.shape[1:]), rows.dtype)))
-
     states, offsets, n_frames = [], [], []
     for window in scene_windows:
         start, stop = window.start, min(window.stop, len(window.scene))
@@ -322,8 +325,8 @@ def build_windows(scene_windows: Sequence[SceneWindow], length: int, config: Den
     hands = [window.active_hands if config.condition_on_hands else np.ones(2, bool) for window in scene_windows]
     scales = np.array([window.scene.object_scale for window in scene_windows], np.float32)
     return Windows(
-        basis_offset=torch.from_numpy(np.stack([padded(rows.astype(np.float32)) for rows in offsets])),
-        state=torch.from_numpy(np.stack([padded(rows.astype(np.float32)) for rows in states])),
+        basis_offset=padded(offsets, length),
+        state=padded(states, length),
         object_scale=torch.from_numpy(scales),
         point_exists=torch.from_numpy(np.stack([window.scene.point_exists for window in scene_windows])),
         active_hands=torch.from_numpy(np.stack(hands)),

@@ -27,7 +27,7 @@ from models.bimart.network import (
     build_windows,
     layout_of,
 )
-from models.bimart.scene import FeatureConfig, Scene, split_motion
+from models.bimart.scene import Scene, split_motion
 from models.common.checkpoints import Checkpoint
 from models.common.sampling import SamplerConfig, sample
 
@@ -78,7 +78,6 @@ def paper_step(keypoints_m: Tensor, target: ContactTarget, scale: Tensor, window
 
     Args:
         keypoints_m: (B, F, 2, J, 3).
-        target: the contact map.
         scale: (2, J, 3) metres per normalised unit.
         window_frames: frames of a window; a longer motion gets a longer step.
 
@@ -102,7 +101,6 @@ def metre_step(keypoints_m: Tensor, target: ContactTarget) -> Tensor:
 
     Args:
         keypoints_m: (B, F, 2, J, 3).
-        target: the contact map.
 
     Returns:
         (B, F, 2, J, 3) metres.
@@ -212,7 +210,10 @@ class BimArt:
         contact_model, motion_model = contact.network, motion.network
         assert isinstance(contact_model, ContactModel)
         assert isinstance(motion_model, MotionModel)
-        expected, got = (_shared_features(model.config.features) for model in (contact_model, motion_model))
+        # The features that a pair must have in common; the others are set to fixed values.
+        expected, got = (
+            replace(model.config.features, state="local", window_frames=0) for model in (contact_model, motion_model)
+        )
         if got != expected:
             raise BadInput("bimart-motion", f"features of its contact model, {expected}", f"{got}", "train both alike")
         return cls(contact_model, motion_model, config, device)
@@ -239,11 +240,9 @@ class BimArt:
 
     def _contact_mask(self, tasks: Sequence[SamplingTask]) -> Tensor:
         """(B, frame, 2N) bool: contact distances of existing object points to active hands."""
-        masks = np.stack([(self._active_hands(task)[:, None] & task.scene.point_exists).ravel() for task in tasks])
-        return torch.from_numpy(masks).to(self.device)[:, None].expand(-1, len(tasks[0].scene), -1)
-
-    def _active_hands(self, task: SamplingTask) -> np.ndarray:
-        return task.active_hands if self.motion.config.condition_on_hands else np.ones(2, bool)
+        of_all = not self.motion.config.condition_on_hands
+        masks = [((task.active_hands | of_all)[:, None] & task.scene.point_exists).ravel() for task in tasks]
+        return torch.from_numpy(np.stack(masks)).to(self.device)[:, None].expand(-1, len(tasks[0].scene), -1)
 
     def _sample(
         self,
@@ -317,8 +316,3 @@ class BimArt:
         else:
             step = metre_step(keypoints, target) / scale
         return torch.cat((clean[..., :half] + step.flatten(2), clean[..., half:]), -1)
-
-
-def _shared_features(features: FeatureConfig) -> FeatureConfig:
-    """The features that both networks of a pair must have in common; the others are set to fixed values."""
-    return replace(features, state="local", window_frames=0)

@@ -5,11 +5,11 @@ ordered top (the moving part, 1), base (0).
 """
 
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 import torch
+from cachetools import LRUCache, cached
 
 from hoidata.batches.dataset import ClipSample
 from hoidata.clips.clip import FPS, SIDES
@@ -92,7 +92,7 @@ class Scene:
     def of(cls, model: ObjectModel, object_features: np.ndarray, basis: BasisSettings) -> "Scene":
         """Build from features (frame, 10) in the model frame (``hoidata.clips.features``)."""
         object_features = object_features.astype(np.float64)
-        bps, object_from_canonical = _basis_structures(_ModelIdentity(model), basis)
+        bps, object_from_canonical = _basis_structures(model, basis)
         hinge_rad = np.zeros(len(object_features))
         if model.is_articulated:
             hinge_rad = object_features[:, OBJECT_HINGE] * model.joint_scale
@@ -126,22 +126,9 @@ class Scene:
         return np.concatenate((canonical_from_model @ DOWN, velocity, angular_velocity), axis=1)
 
 
-class _ModelIdentity:
-    """A cache key: equal for the same object in memory, because arrays have no hash."""
-
-    def __init__(self, model: ObjectModel) -> None:
-        self.model = model
-
-    def __hash__(self) -> int:
-        return id(self.model)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _ModelIdentity) and other.model is self.model
-
-
-@lru_cache(maxsize=64)
-def _basis_structures(key: _ModelIdentity, basis: BasisSettings) -> tuple[PartBps, RigidTransform]:
-    canonical, object_from_canonical = canonical_object(key.model, basis.frame)
+@cached(LRUCache(64), key=lambda model, basis: (model.digest, basis))
+def _basis_structures(model: ObjectModel, basis: BasisSettings) -> tuple[PartBps, RigidTransform]:
+    canonical, object_from_canonical = canonical_object(model, basis.frame)
     return PartBps(canonical, basis), object_from_canonical
 
 

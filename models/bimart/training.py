@@ -22,6 +22,7 @@ from models.bimart.network import (
     Windows,
     build_windows,
     contact_channels,
+    padded,
 )
 from models.bimart.scene import RecordedClip, recorded_clip
 from models.common.family import Losses, Network, Setup
@@ -188,21 +189,16 @@ def targets_of(network: Denoiser, clip_windows: Sequence[ClipWindow]) -> Targets
     clips = [clip for clip, _ in clip_windows]
     frames = [slice(start, start + length) for _, start in clip_windows]
     contact = [clip.contact_m[:, rows].transpose(1, 0, 2) for clip, rows in zip(clips, frames, strict=True)]
-    contact_m = _padded([values.reshape(len(values), -1) for values in contact], length)
+    contact_m = padded([values.reshape(len(values), -1) for values in contact], length)
     windows = replace(windows, contact_m=contact_m)
     motion = [clip.motion[rows] for clip, rows in zip(clips, frames, strict=True)]
-    clean = contact_m if isinstance(network, ContactModel) else _padded(motion, length)
-    present = _padded([clip.present[:, rows].T for clip, rows in zip(clips, frames, strict=True)], length).bool()
+    clean = contact_m if isinstance(network, ContactModel) else padded(motion, length)
+    present = padded([clip.present[:, rows].T for clip, rows in zip(clips, frames, strict=True)], length).bool()
     contact_mask = present.repeat_interleave(config.features.object_points, 2) & contact_channels(windows)
     clean_mask = contact_mask
     if isinstance(network, MotionModel):
         clean_mask = config.features.spread_over_motion(present) & network.channel_mask(windows)
     return Targets(windows, clean, clean_mask, contact_mask)
-
-
-def _padded(windows: Sequence[np.ndarray], length: int) -> Tensor:
-    padded = [np.concatenate((rows, np.zeros((length - len(rows), rows.shape[1]), rows.dtype))) for rows in windows]
-    return torch.from_numpy(np.stack(padded).astype(np.float32))
 
 
 @torch.no_grad()

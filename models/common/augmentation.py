@@ -6,6 +6,7 @@ the motion that it is to denoise. Augmentation changes what the condition does n
 
 import math
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 
 import numpy as np
 import torch
@@ -45,7 +46,7 @@ class Augmentation:
 
     dataset: HoiDataset
     count: int
-    cache: LRUCache = field(default_factory=lambda: LRUCache(MAX_CACHE_BYTES, _bytes))
+    cache: LRUCache = field(default_factory=lambda: LRUCache(MAX_CACHE_BYTES, attrgetter("nbytes")))
 
     @cachedmethod(lambda self: self.cache, key=lambda self, clip_id, number: (clip_id, number))
     def copy_of(self, clip_id: str, number: int) -> ClipSample:
@@ -56,10 +57,6 @@ class Augmentation:
             start = np.random.default_rng([*seed, 1]).integers(0, spare + 1) if self.dataset.crop == "random" else 0
             sample = sample.crop(int(start), self.dataset.max_frames)
         return augment(sample, np.random.default_rng(seed), number)
-
-
-def _bytes(sample: ClipSample) -> int:
-    return sample.nbytes
 
 
 def augment(sample: ClipSample, random: np.random.Generator, number: int) -> ClipSample:

@@ -95,13 +95,6 @@ def predict_fingers(predictor: Predictor, hand: TrackedHand, side: Side, control
 
     The prediction starts at the pose before the gap, or at the neutral pose. It is blended to the poses before and
     after the gap over ``SEAM_S``.
-
-    Args:
-        predictor: the network.
-        hand: skeleton and capsules of the hand.
-        side: of the hand.
-        control: wrists and object at 30 fps.
-        gap: the frames to fill.
     """
     known_frames = int(gap.before is not None)
     start = hand.rest_rotmats if gap.before is None else gap.before
@@ -152,8 +145,6 @@ def with_fingers(track: HandTrack, frames: slice, fingers: np.ndarray, wrist: Mo
     """Replace the finger poses of some frames, which become valid.
 
     Args:
-        track: the hand.
-        frames: to replace.
         fingers: (frame, 15, 3, 3).
         wrist: the wrist of all frames; it replaces the track's wrist in untracked frames.
     """

@@ -67,8 +67,6 @@ def diagnose(
     """Mean joint errors on at most ``DIAGNOSED_CLIPS`` test clips, millimetres.
 
     Args:
-        sources: the dataset.
-        settings: of the features that baselines compare.
         predict_clip: returns finger rotations (frame, 15, 3, 3) by side.
     """
     training_hands = thinned(

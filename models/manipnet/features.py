@@ -68,9 +68,7 @@ def pose_features(hand: TrackedHand, state: HandState, settings: FeatureSettings
     """Pose of a hand as the network reads it.
 
     Args:
-        hand: the hand's skeleton and capsules.
         state: (frame,) the hand in its wrist's frame.
-        settings: of the features.
 
     Returns:
         (frame, 9 joints + 15 + 6 palm capsules), metres, canonical axes: joint positions, tips, starts and ends of the
@@ -83,14 +81,10 @@ def pose_features(hand: TrackedHand, state: HandState, settings: FeatureSettings
         rotmats = np.concatenate([rotmats, rotmats[:, hand.tip_joint]], axis=1)
     else:
         positions_m += [state.capsule_start_m[:, palm], state.capsule_end_m[:, palm]]
-    axes = canonical.T @ rotmats @ canonical
-    vectors = np.concatenate([np.concatenate(positions_m, axis=1) @ canonical, _axis_rows(axes)], axis=1)
+    z_then_y = (canonical.T @ rotmats @ canonical)[..., [2, 1]].swapaxes(-1, -2)
+    axes = z_then_y.reshape(len(rotmats), -1, 3)  # (frame, 2 joints, 3)
+    vectors = np.concatenate([np.concatenate(positions_m, axis=1) @ canonical, axes], axis=1)
     return vectors.reshape(len(vectors), -1)
-
-
-def _axis_rows(rotmats: np.ndarray) -> np.ndarray:
-    """(frame, 2 joints, 3): z axis, then y axis of each rotation (frame, joint, 3, 3)."""
-    return rotmats[..., [2, 1]].swapaxes(-1, -2).reshape(len(rotmats), -1, 3)
 
 
 def joint_rotmats_of(hand: TrackedHand, pose: np.ndarray, settings: FeatureSettings) -> np.ndarray:
@@ -99,9 +93,7 @@ def joint_rotmats_of(hand: TrackedHand, pose: np.ndarray, settings: FeatureSetti
     The predicted axes are orthonormalised by Gram-Schmidt, z first.
 
     Args:
-        hand: the hand's skeleton.
         pose: (frame, 192 or more).
-        settings: of the features.
 
     Returns:
         (frame, joint, 3, 3) wrist_from_joint; ``hand.finger_rotmats`` converts them to local rotations.

@@ -55,12 +55,9 @@ def reach(
     """Rotate finger joints so that points reach their targets.
 
     Args:
-        hand: the hand's skeleton.
-        limits: of its joints.
         state: one frame, wrist frame.
         target_m: (point, 3) wrist frame, joints then tips.
         weight: (point,) of the squared error; 0: no target. The wrist and the knuckles cannot move.
-        steps: damped Gauss-Newton steps.
 
     Returns:
         (1, joint - 1, 3, 3) finger rotations.

@@ -68,8 +68,6 @@ def paper_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndar
     Args:
         points_m: (..., point, 3) of the predicted pose.
         predicted: (..., point) output distances, as fractions of ``range_m``.
-        radius_m: (point,) see ``distance_offset_m``.
-        range_m: see ``FeatureSettings``.
         nearest: the object's surface at ``points_m``.
 
     Returns:
@@ -95,8 +93,6 @@ def our_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarra
     Args:
         points_m: (point, 3) of the predicted pose.
         predicted: (point,) output distances, as fractions of ``range_m``.
-        radius_m: (point,) see ``distance_offset_m``.
-        range_m: see ``FeatureSettings``.
         is_near: (point,) bool, whether the predicted points are at the object or in it.
         thickness_m: (point,) radius of the finger at the point.
         nearest: the object's surface at the points of the solver's present pose.

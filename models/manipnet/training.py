@@ -62,14 +62,9 @@ def hand_examples(
     """Training steps of a recorded hand.
 
     Args:
-        control: wrists and object.
-        side: of the hand.
-        hand: its skeleton and capsules.
         finger_rotmats: (frame, joint - 1, 3, 3) recorded.
         time_s: (frame,) one step apart.
         usable: (frame,) bool; a step needs two usable frames.
-        surface: of the object.
-        settings: of the features.
         start_rotmats: (frame, joint - 1, 3, 3) perturbed poses to start from; the targets are the recorded ones.
             The paper trains from recorded poses only. Such a network may keep any pose it is given.
     """
@@ -141,9 +136,6 @@ def clip_examples(
     """Training steps of the active hands of a whole clip.
 
     Args:
-        sample: the clip.
-        pair: the hand model.
-        settings: of the features.
         pool: (pose, 15, 3, 3) as a right hand's; steps start from poses perturbed towards it. None: recorded poses.
     """
     hands = hands_of(pair, sample.betas, sample.template_m)

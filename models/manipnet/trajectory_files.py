@@ -63,7 +63,6 @@ def read_trajectories(path: Path, unit: str = "", axes: Axes = "model") -> Traje
     """Read a file in the format of its suffix.
 
     Args:
-        path: .csv, .npz or .txt.
         unit: of the positions in a CSV or NPZ file; "": metres.
         axes: of the wrists in a CSV or NPZ file.
 

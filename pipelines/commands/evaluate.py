@@ -1,4 +1,4 @@
-"""``hoidata evaluate``, ``table`` and ``controls``: metrics of a store, of a dataset, and of its negative controls."""
+"""``hoidata evaluate``, ``compare``, ``table`` and ``controls``: metrics of stores, corpora and negative controls."""
 
 import json
 import sys
@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from pipelines.commands.project import hands_of_dataset
+from pipelines.commands.project import hands_of_data
 
 if TYPE_CHECKING:
+    import numpy as np
     from rich.table import Table
 
     from pipelines.expected_orderings import OrderingResult
@@ -54,7 +55,7 @@ def evaluate(
     from pipelines.stages.evaluate import trained_encoders
 
     encoders = trained_encoders(evaluators or evaluators_of(reference))
-    hands, chosen_metrics = hands_of_dataset(reference), select_metrics(filter(None, metrics.split(",")))
+    hands, chosen_metrics = hands_of_data(reference), select_metrics(filter(None, metrics.split(",")))
     results = evaluate_store(
         store, reference, hands, split=split, metrics=chosen_metrics, encoders=encoders, jobs=jobs(), progress=True
     )
@@ -77,6 +78,49 @@ def evaluators_of(reference: Path) -> Path:
 
     project = reference.parent.parent.parent
     return project / StagePaths(reference.parent.name, reference.name).evaluators
+
+
+def compare(
+    corpus: Annotated[
+        Path, typer.Argument(help="An annotated dataset, such as data/embedded/grab.", exists=True, resolve_path=True)
+    ],
+    reference: Annotated[
+        Path, typer.Argument(help="The annotated dataset to compare with.", exists=True, resolve_path=True)
+    ],
+    clips: Annotated[int, typer.Option(min=1, help="Clips of each corpus, evenly chosen, at most.")] = 400,
+    out: Annotated[Path | None, typer.Option(help="Also write all values as JSON.", resolve_path=True)] = None,
+) -> None:
+    """Compare the recorded motion of two corpora: fingers, slip, jitter, contact, grasps, speeds, hinges."""
+    from rich import box
+    from rich.table import Table
+
+    from hoidata.files import write_whole
+    from hoidata.metrics.corpus_statistics import STATISTICS, compare_corpora, corpus_statistics
+    from hoidata.store.annotated import load_annotated
+
+    values, others = (
+        corpus_statistics(load_annotated(folder, hands_of_data(folder)), clips) for folder in (corpus, reference)
+    )
+    rows = compare_corpora(values, others)
+    table = Table(title=f"{corpus} compared with {reference}", box=box.SIMPLE)
+    for name in ("statistic", "unit", "mean", "10-90 %", "reference", "10-90 %", "ratio", "KS distance"):
+        table.add_column(name, justify="left" if name in ("statistic", "unit") else "right")
+    for row in rows:
+        shown = (_mean(row.values), _spread(row.values), _mean(row.reference), _spread(row.reference))
+        table.add_row(row.name, row.unit, *shown, f"{row.ratio:.2f}", f"{row.distance:.2f}")
+    Console(width=None if sys.stdout.isatty() else 140).print(table)
+    typer.echo(f"{len(values['frames with contact'])} and {len(others['frames with contact'])} clips with contact")
+    if out is not None:
+        written = {
+            name: {
+                "meaning": meaning,
+                "unit": unit,
+                "values": values[name].tolist(),
+                "reference": others[name].tolist(),
+            }
+            for name, (unit, meaning) in STATISTICS.items()
+        }
+        write_whole(out, json.dumps(written, indent=1, sort_keys=True, allow_nan=False) + "\n")
 
 
 def table(
@@ -132,3 +176,13 @@ def _table(title: str, results: "list[OrderingResult]") -> "Table":
         ordering, values = item.ordering, (number(item.reference), number(item.value))
         table.add_row(ordering.control, ordering.metric, ordering.reference, *values, ordering.must, WORDS[item.holds])
     return table
+
+
+def _mean(values: "np.ndarray") -> str:
+    return f"{values.mean():.3g}" if len(values) else "not measured"
+
+
+def _spread(values: "np.ndarray") -> str:
+    import numpy as np
+
+    return "{:.3g}-{:.3g}".format(*np.percentile(values, [10, 90])) if len(values) else ""

@@ -36,19 +36,12 @@ def export(data: Data, to: To, out: Out, clip: ClipIds = None, for_own_use: OwnU
 
     Refuses data that its licence forbids to share, unless --for-own-use is given.
     """
-    from contextlib import suppress
-
-    from hoidata.errors import MissingResource
-    from hoidata.store.store import open_store, read_info
-    from pipelines.commands.project import enter_project, hands_of
+    from hoidata.store.store import open_store
+    from pipelines.commands.project import hands_of_data, store_in
     from pipelines.exports.export import export_store
 
-    folder = data if (data / "meta").is_dir() else data / "clips"
-    info = read_info(folder)
-    with suppress(MissingResource):
-        enter_project()  # the project's hoidata.toml names the user's MANO files
-    hands = hands_of(info["hand_model"]["digest"], str(data))
-    facts = export_store(open_store(folder, hands), to, out, tuple(clip or ()), for_own_use)
+    store = open_store(store_in(data), hands_of_data(data))
+    facts = export_store(store, to, out, tuple(clip or ()), for_own_use)
     for clip_id, reason in facts["left_out"].items():
         typer.echo(f"skipped {clip_id}: {reason}", err=True)
     typer.echo(out)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from pipelines.commands.project import current_profile, enter_project, hands_of
+from pipelines.params import read_params
 
 if TYPE_CHECKING:
     import numpy as np
@@ -59,85 +60,98 @@ WorldUp = Annotated[
 ]
 
 
+# Options of `generate`.
+Text = Annotated[str, typer.Argument(help="The sentence, such as 'Lift a box with the right hand.'")]
+RequestedObject = Annotated[
+    str,
+    typer.Option(
+        "--object",
+        help="A mesh file (OBJ, PLY, STL, GLB), a URDF or its folder, or a dataset's object.",
+    ),
+]
+Seed = Annotated[int, typer.Option(help="Random seed; the same seed gives the same bytes.", min=0, max=2**63 - 1)]
+PromptedHand = Annotated[
+    Literal["left", "right", "both"] | None,
+    typer.Option(help="Hands that act. Default: derived from the sentence, see --hand-by."),
+]
+PredictedLength = Annotated[
+    float | None, typer.Option(help="Duration in seconds. Default: the length network's prediction.")
+]
+ModelFolder = Annotated[
+    Path | None,
+    typer.Option(
+        help="Folder with the checkpoints of one dataset, such as checkpoints/embedded/grab; works outside of a "
+        "project. Default: the project's checkpoints.",
+        exists=True,
+        file_okay=False,
+    ),
+]
+Sampler = Annotated[
+    Literal["ddim", "ddpm", "dpm++"] | None,
+    typer.Option(help="Diffusion sampler. Default: params.yaml; without it ddim, ddpm for preset paper."),
+]
+Steps = Annotated[
+    int | None,
+    typer.Option(
+        help="Number of denoising steps. Default: params.yaml; without it 20, 1000 for preset paper.",
+        min=1,
+        max=1000,
+    ),
+]
+Refine = Annotated[
+    Literal["network", "contact", "none"] | None,
+    typer.Option(
+        help="What corrects the hands: the refiner network, contact refinement by optimisation, or nothing. "
+        "Default: params.yaml; without it network."
+    ),
+]
+Attempts = Annotated[
+    int | None,
+    typer.Option(help="Rejection sampling: the best of at most so many motions. Default: params.yaml, 1.", min=1),
+]
+HandBy = Annotated[
+    Literal["rules", "similarity"] | None,
+    typer.Option(
+        help="How to choose the hands without --hand. rules: grammar rules; for a phrase they do not cover, the "
+        "similarity of text features; for a sentence without a hand, the most frequent one in training. "
+        "similarity: Text2HOI's method, the most similar of three phrases. Default: rules; similarity for preset "
+        "paper."
+    ),
+]
+Encoder = Annotated[
+    str,
+    typer.Option(
+        help="Text encoder for --models that were trained with CLIP: clip:FILE.safetensors or clip:openai. "
+        "Default: the encoder that the checkpoints name."
+    ),
+]
+
+
 def generate(
-    text: Annotated[str, typer.Argument(help="The sentence, such as 'Lift a box with the right hand.'")],
-    object: Annotated[
-        str,
-        typer.Option(
-            "--object",
-            help="A mesh file (OBJ, PLY, STL, GLB), a URDF or its folder, or a dataset's object.",
-        ),
-    ],
+    text: Text,
+    object: RequestedObject,
     out: Out,
     store: Store = None,
-    seed: Annotated[
-        int, typer.Option(help="Random seed; the same seed gives the same bytes.", min=0, max=2**63 - 1)
-    ] = 0,
+    seed: Seed = 0,
     samples: Annotated[int, typer.Option(help="Number of motions to generate.", min=1, max=32)] = 1,
-    hand: Annotated[
-        Literal["left", "right", "both"] | None,
-        typer.Option(help="Hands that act. Default: derived from the sentence, see --hand-by."),
-    ] = None,
-    length: Annotated[
-        float | None, typer.Option(help="Duration in seconds. Default: the length network's prediction.")
-    ] = None,
-    models: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder with the checkpoints of one dataset, such as checkpoints/embedded/grab; works outside of a "
-            "project. Default: the project's checkpoints.",
-            exists=True,
-            file_okay=False,
-        ),
-    ] = None,
+    hand: PromptedHand = None,
+    length: PredictedLength = None,
+    models: ModelFolder = None,
     model: Annotated[
         str,
         typer.Option(help="Dataset whose models to use. Default: the one whose vocabulary fits the sentence best."),
     ] = "",
-    sampler: Annotated[
-        Literal["ddim", "ddpm", "dpm++"] | None,
-        typer.Option(help="Diffusion sampler. Default: params.yaml; without it ddim, ddpm for preset paper."),
-    ] = None,
-    steps: Annotated[
-        int | None,
-        typer.Option(
-            help="Number of denoising steps. Default: params.yaml; without it 20, 1000 for preset paper.",
-            min=1,
-            max=1000,
-        ),
-    ] = None,
-    refine: Annotated[
-        Literal["network", "contact", "none"] | None,
-        typer.Option(
-            help="What corrects the hands: the refiner network, contact refinement by optimisation, or nothing. "
-            "Default: params.yaml; without it network."
-        ),
-    ] = None,
-    attempts: Annotated[
-        int | None,
-        typer.Option(help="Rejection sampling: the best of at most so many motions. Default: params.yaml, 1.", min=1),
-    ] = None,
+    sampler: Sampler = None,
+    steps: Steps = None,
+    refine: Refine = None,
+    attempts: Attempts = None,
     unit: Unit = "",
     up: Up = "",
     hinge: MeshHinge = "",
     moving: Moving = "",
-    hand_by: Annotated[
-        Literal["rules", "similarity"] | None,
-        typer.Option(
-            help="How to choose the hands without --hand. rules: grammar rules; for a phrase they do not cover, the "
-            "similarity of text features; for a sentence without a hand, the most frequent one in training. "
-            "similarity: Text2HOI's method, the most similar of three phrases. Default: rules; similarity for preset "
-            "paper."
-        ),
-    ] = None,
+    hand_by: HandBy = None,
     profile: Profile = "",
-    encoder: Annotated[
-        str,
-        typer.Option(
-            help="Text encoder for --models that were trained with CLIP: clip:FILE.safetensors or clip:openai. "
-            "Default: the encoder that the checkpoints name."
-        ),
-    ] = "",
+    encoder: Encoder = "",
     force: Annotated[bool, typer.Option("--force", help="Generate even if the sentence has unknown words.")] = False,
 ) -> None:
     """Generate hand-object motions for a sentence and an object; write arrays, an animated GLB and a web page."""
@@ -149,17 +163,13 @@ def generate(
         | {"--hand-by": hand and hand_by}
         | ({} if mesh or Path(object).suffix else {"--unit": unit, "--up": up, "--hinge": hinge, "--moving": moving})
     )
-    root = enter_project() if models is None else None
+    project = ("", ()) if models else _project(profile)
     from hoidata.clips.clip import FPS
     from hoidata.errors import BadInput
     from models.text2hoi.generation import MotionOptions
     from pipelines.command_inputs import MeshOptions
     from pipelines.generation import GenerationRequest, generate_files
-    from pipelines.params import read_params
 
-    model_source: dict[str, Any] = {"models": _models_in(models, encoder)} if models else {}
-    if root is not None:
-        model_source = {"profile": profile or current_profile(), "datasets": tuple(read_params(root)["datasets"])}
     if length is not None and not isfinite(length * FPS):
         raise BadInput("--length", "seconds", f"{length:g}", "omit it for a length that the network predicts")
     given = {"kind": sampler, "steps": steps}, {"refine": refine, "attempts": attempts}
@@ -168,13 +178,14 @@ def generate(
     request = GenerationRequest(
         text,
         mesh or object,
+        *project,
         model=model,
+        models=_models_in(models, encoder) if models else None,
         options=MotionOptions(seed=seed, samples=samples, hand=hand, frames=frames, hand_by=hand_by),
         mesh=MeshOptions(unit, up, hinge, moving),
         sampler=of_sampler,
         sampling=of_sampling,
         force=force,
-        **model_source,
     )
     _print_written(generate_files(request, out, store))
 
@@ -252,19 +263,12 @@ def animate(
     profile: Profile = "",
 ) -> None:
     """Generate finger motion for given wrist and object trajectories; write arrays, an animated GLB and a web page."""
-    start_folder = Path.cwd()
-    project = enter_project()
+    source, object = map(_absolute, (source, object))
+    project = _project(profile)
     from hoidata.clips.clip import SIDES
-    from hoidata.objects.user_mesh import is_object_path
     from pipelines.animation import AnimationOptions, animate_files
     from pipelines.command_inputs import MeshOptions
-    from pipelines.params import read_params
 
-    # Paths are relative to the folder in which the command was typed.
-    source, object = (
-        str(start_folder / name) if name and is_object_path(str(start_folder / name)) else name
-        for name in (source, object)
-    )
     options = AnimationOptions(
         sides=SIDES if fingers == "both" else (fingers,),
         frames=frames,
@@ -277,8 +281,7 @@ def animate(
         mesh=MeshOptions(unit, "", hinge),
         method=way,
     )
-    datasets = tuple(read_params(project)["datasets"])
-    _print_written(animate_files(source, options, profile or current_profile(), datasets, out, store))
+    _print_written(animate_files(source, options, *project, out, store))
 
 
 def stream(
@@ -359,18 +362,17 @@ def hands(
     profile: Profile = "",
 ) -> None:
     """Generate hand motion for a given object motion; write arrays, an animated GLB per sample and a web page."""
-    start_folder = Path.cwd()
-    project = enter_project()
-    from hoidata.objects.user_mesh import is_object_path
+    object = _absolute(object)
+    keyframes, motion = (name and str(Path(name).absolute()) for name in (keyframes, motion))
+    project = _project(profile)
     from pipelines.command_inputs import MeshOptions
     from pipelines.hands import HandsOptions, hands_files
-    from pipelines.params import read_params
 
     options = HandsOptions(
-        object=str(start_folder / object) if object and is_object_path(str(start_folder / object)) else object,
-        keyframes=str(start_folder / keyframes) if keyframes else "",
+        object=object,
+        keyframes=keyframes,
         clip=clip,
-        motion=str(start_folder / motion) if motion else "",
+        motion=motion,
         mesh=MeshOptions(unit, up, hinge, moving),
         hinge_range=hinge_range,
         hand=hand,
@@ -379,8 +381,21 @@ def hands(
         length_s=length,
         model=model,
     )
-    datasets = tuple(read_params(project)["datasets"])
-    _print_written(hands_files(options, profile or current_profile(), datasets, out, store))
+    _print_written(hands_files(options, *project, out, store))
+
+
+def _absolute(name: str) -> str:
+    """The absolute path of a file or a folder with a URDF, since commands change into the project; else the name."""
+    from hoidata.objects.user_mesh import is_object_path
+
+    path = str(Path(name).absolute())
+    return path if name and is_object_path(path) else name
+
+
+def _project(profile: str) -> tuple[str, tuple[str, ...]]:
+    """Enter the project. Returns the profile, by default the chosen one, and the datasets."""
+    params = read_params(enter_project())
+    return profile or params["profile"], tuple(params["datasets"])
 
 
 def _print_written(written: "WrittenFiles") -> None:

@@ -70,13 +70,19 @@ def chosen_hands(choice: str) -> "HandPair":
     return load_embedded_hands() if folder is None else load_mano_hands(folder)
 
 
-def hands_of_dataset(folder: Path) -> "HandPair":
-    """The hand model that an annotated dataset was converted with: the embedded one, or the user's MANO files."""
+def store_in(data: Path) -> Path:
+    """The store of an annotated dataset; a store itself is returned."""
+    return data if (data / "meta").is_dir() else data / "clips"
+
+
+def hands_of_data(data: Path) -> "HandPair":
+    """The hand model of a store or annotated dataset: the embedded one, or the user's MANO files."""
     from hoidata.store.store import read_info
 
+    digest = read_info(store_in(data))["hand_model"]["digest"]
     with suppress(MissingResource):
         enter_project()  # its hoidata.toml names the user's MANO files
-    return hands_of(read_info(folder / "clips")["hand_model"]["digest"], str(folder))
+    return hands_of(digest, str(data))
 
 
 def hands_of(digest: str, source: str) -> "HandPair":

@@ -83,8 +83,6 @@ def _require_parts(adapter, root: Path, also: str = "") -> None:
     """Raise BadInput if the folder lacks a required part; print missing optional parts. Both with their download page.
 
     Args:
-        adapter: of the dataset.
-        root: the raw folder.
         also: another problem to add to the message.
     """
     from pipelines.lineage.manifests import missing_parts
@@ -130,7 +128,6 @@ def _verify_one(dataset: str, is_required: bool) -> bool:
     """Print the differences of one dataset's files from its manifest. Returns whether they agree.
 
     Args:
-        dataset: the dataset.
         is_required: whether its absence is a problem.
     """
     from pipelines.lineage.manifests import read_manifest, verify_files

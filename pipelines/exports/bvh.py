@@ -10,12 +10,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-import orjson
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import FPS, SIDES, ObjectTrack, Side
 from hoidata.hands import JOINT_NAMES, PARENTS
-from pipelines.exports.motion import ExportedClip, hinge_of
+from pipelines.exports.motion import ExportedClip, hinge_of, write_json
 from pipelines.pages.glb import upright_rotation
 
 # Parents of the tips: the last joints of index, middle, pinky, ring, thumb.
@@ -34,9 +33,7 @@ def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
         for name, (names, tree, positions_m, rotations) in skeletons.items():
             upright = _upright(positions_m, rotations, upright_rotation(item.clip.gravity))
             _write_bvh(folder / item.file_name / f"{name}.bvh", names, tree, *upright)
-        (folder / item.file_name / "clip.json").write_bytes(
-            orjson.dumps(item.motion_facts, option=orjson.OPT_INDENT_2) + b"\n"
-        )
+        write_json(folder / item.file_name / "clip.json", item.motion_facts)
 
 
 def _upright(positions_m: np.ndarray, rotations: Rotation, up_from_world: Rotation) -> tuple[np.ndarray, Rotation]:
@@ -75,8 +72,6 @@ def _write_bvh(
     """Write one BVH file.
 
     Args:
-        path: of the file.
-        names: of the joints.
         tree: index of each joint's parent; -1 for the root.
         positions_m: (frame, joint, 3) in the parent joint's frame.
         rotations: (frame x joint) relative to the parent joint.

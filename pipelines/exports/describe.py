@@ -10,7 +10,6 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-import orjson
 import pyarrow as pa
 import pyarrow.parquet as pq
 import yaml
@@ -21,7 +20,7 @@ from hoidata.store.fields import STORE_FILES, StoreFile
 from hoidata.store.info import embedded_hand_warning
 from hoidata.store.store import Store
 from pipelines.exports.licences import OWN_USE, ArrayLicence, licences_of
-from pipelines.exports.motion import Column
+from pipelines.exports.motion import Column, write_json
 
 _MARKUP = re.compile(r"[\\`*_\[\]|~$]")
 CROISSANT = "http://mlcommons.org/croissant/1.1"
@@ -74,8 +73,7 @@ class Description:
 def write_description(folder: Path, store: Store, to: str, description: Description) -> None:
     """Write croissant.json and README.md about the files in ``folder``; for the format croissant, about the store."""
     root = store.folder if to == "croissant" else folder
-    values = croissant(root, store, description)
-    (folder / "croissant.json").write_bytes(orjson.dumps(values, option=orjson.OPT_INDENT_2) + b"\n")
+    write_json(folder / "croissant.json", croissant(root, store, description))
     (folder / "README.md").write_text(dataset_card(root, store, description), encoding="utf-8")
 
 
@@ -183,6 +181,7 @@ def _responsible(store: Store, description: Description) -> dict[str, Any]:
     facts = dataset_facts(str(info["dataset"]))
     errors_m = rows["fit_error_m"].dropna().tolist()  # of hands fitted to keypoints
     verbs = Counter(rows["verb"].dropna().tolist())
+    verbs_by_count = sorted(verbs.items(), key=lambda pair: (-pair[1], str(pair[0])))
     source = facts.paper if facts and facts.paper else info["dataset"]
     limits = [f"gravity: {info['frame']['gravity']}"]
     if errors_m:
@@ -205,7 +204,7 @@ def _responsible(store: Store, description: Description) -> dict[str, Any]:
         "dataAnnotationProtocol": "verbs and objects as labelled by the source; sentences from rules applied to them",
         "dataBiases": [
             f"{rows['subject'].nunique()} subjects, {counts['objects']} objects, {len(verbs)} verbs; most frequent: "
-            + ", ".join(f"{verb} ({count})" for verb, count in sorted(verbs.items(), key=_by_count)[:3])
+            + ", ".join(f"{verb} ({count})" for verb, count in verbs_by_count[:3])
         ],
         "dataLimitations": limits,
         "dataUseCases": ["training and evaluation of models of hand-object motion"],
@@ -214,10 +213,6 @@ def _responsible(store: Store, description: Description) -> dict[str, Any]:
             ["motion and shape of hands of persons known by the source's ids"]
         ),
     }  # fmt: skip
-
-
-def _by_count(pair: tuple[Any, int]) -> tuple[int, str]:
-    return -pair[1], str(pair[0])
 
 
 def _name(store: Store) -> str:

@@ -32,7 +32,7 @@ from pipelines.exports.licences import (
     check_may_be_shared,
     licences_of,
 )
-from pipelines.exports.motion import CLIP_COLUMNS, COLUMNS, WORLD, Y_UP, Column, ExportedClip, Source
+from pipelines.exports.motion import CLIP_COLUMNS, COLUMNS, WORLD, Y_UP, Column, ExportedClip, Source, write_json
 from pipelines.pages.glb import glb_bytes
 
 CLIPS_PER_SHARD = 500
@@ -126,12 +126,7 @@ def export_store(
     """Write the clips of a store into a new folder. Equal stores give equal bytes.
 
     Args:
-        store: the store of clips.
-        to: the format, a key of ``FORMATS``.
-        out: the output folder; must not exist.
         clip_ids: the clips to export; empty for all.
-        for_own_use: whether to export data that must not be shared.
-        progress: whether to show a progress bar.
 
     Returns:
         The content of export.json.
@@ -139,7 +134,9 @@ def export_store(
     Raises:
         BadInput: the format or a clip is unknown, the store has no clips, ``out`` exists, or a licence forbids sharing.
     """
-    form = _format(to)
+    if to not in FORMATS:
+        raise BadInput("--to", f"one of {', '.join(FORMATS)}", repr(to), "choose one")
+    form = FORMATS[to]
     if out.exists():
         raise BadInput(
             out, "a path that does not exist", "an existing file or folder", "choose another name, or remove it"
@@ -157,15 +154,9 @@ def export_store(
         facts = _facts(store, to, form, for_own_use) | {"clips": len(source.ids) - len(skipped), "left_out": skipped}
         untracked = "their values are undefined" if form.write is None else "they repeat its last tracked pose"
         description = Description(form.meaning, form.world, untracked, columns=form.columns, for_own_use=for_own_use)
-        (partial / "export.json").write_bytes(orjson.dumps(facts, option=orjson.OPT_INDENT_2) + b"\n")
+        write_json(partial / "export.json", facts)
         write_description(partial, store, to, description)
     return facts
-
-
-def _format(to: str) -> Format:
-    if to not in FORMATS:
-        raise BadInput("--to", f"one of {', '.join(FORMATS)}", repr(to), "choose one")
-    return FORMATS[to]
 
 
 def _check_clips(store: Store, clip_ids: tuple[str, ...]) -> None:

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import orjson
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hoidata.clips.clip import FPS, SIDES
 from hoidata.store.annotated import SUBSETS
-from pipelines.exports.motion import Column, ExportedClip, frames_array, row_type, state_names
+from pipelines.exports.motion import Column, ExportedClip, frames_array, row_type, state_names, write_json
 
 VERSION = "v3.0"
 FRAMES_PER_FILE = 60_000  # about 100 MB, LeRobot's default size of a data file
@@ -137,9 +136,9 @@ class _Writer:
         pq.write_table(pa.Table.from_pylist(self.episodes), path)
         tasks = pd.DataFrame({"task_index": list(self.tasks.values())}, pd.Index(list(self.tasks), name="task"))
         tasks.to_parquet(self.folder / "meta" / "tasks.parquet")
-        _write_json(self.folder / "meta" / "info.json", self._info())
+        write_json(self.folder / "meta" / "info.json", self._info())
         statistics = {name: _as_written(total, total) for name, total in totals.items()}
-        _write_json(self.folder / "meta" / "stats.json", statistics)
+        write_json(self.folder / "meta" / "stats.json", statistics)
 
     def _info(self) -> dict[str, Any]:
         splits = {name: "{}:{}".format(*self.ranges[name]) for name in SUBSETS if name in self.ranges}
@@ -226,7 +225,3 @@ def _schema() -> pa.Schema:
 
 def _feature(column: Column) -> dict[str, Any]:
     return {"dtype": column.dtype, "shape": list(column.shape or (1,)), "names": _NAMES.get(column.name), "fps": FPS}
-
-
-def _write_json(path: Path, value: dict[str, Any]) -> None:
-    path.write_bytes(orjson.dumps(value, option=orjson.OPT_INDENT_2) + b"\n")

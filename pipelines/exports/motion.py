@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import orjson
 import pyarrow as pa
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
@@ -179,7 +180,6 @@ class Source:
     """The clips of a store, with sentences and subsets from the folders of the stages next to it, if present.
 
     Args:
-        store: the store of clips.
         clip_ids: the clips to export; empty for all.
     """
 
@@ -226,6 +226,11 @@ def _grouped(path: Path, column: str) -> dict[str, list[Any]]:
 def state_names(side: Side) -> list[str]:
     """Names of the 63 joint coordinates of one hand."""
     return [f"{side}.{joint}.{axis}" for joint in JOINT_NAMES for axis in "xyz"]
+
+
+def write_json(path: Path, values: dict[str, Any]) -> None:
+    """Write indented JSON in the order of the values."""
+    path.write_bytes(orjson.dumps(values, option=orjson.OPT_INDENT_2) + b"\n")
 
 
 _ARROW = {"float32": pa.float32(), "int32": pa.int32(), "int64": pa.int64(), "bool": pa.bool_()}

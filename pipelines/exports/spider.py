@@ -11,14 +11,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
-import orjson
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import FPS, SIDES, Clip, Side
 from hoidata.files.arrays import write_npz
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
-from pipelines.exports.motion import ExportedClip, file_name_of
+from pipelines.exports.motion import ExportedClip, file_name_of, write_json
 from pipelines.pages.glb import upright_rotation
 
 WORLD = "rotated so that gravity is -z, z is up"
@@ -45,7 +44,7 @@ def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
         }
         info = {"task": item.file_name, "dataset_name": item.clip.dataset, "robot_type": "mano", "data_id": 0}
         info |= {"embodiment_type": embodiment, "hand_type": embodiment, "ref_dt": 1 / FPS, **meshes}
-        (task / "task_info.json").write_bytes(orjson.dumps(info, option=orjson.OPT_INDENT_2) + b"\n")
+        write_json(task / "task_info.json", info)
 
 
 def unsupported(clip: Clip) -> str:

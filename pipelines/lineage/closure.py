@@ -42,7 +42,6 @@ class SourceTree:
     Parsed imports are cached in ``.hoidata`` by the digest of the file, since parsing takes ten times as long.
 
     Args:
-        root: the project folder.
         outside: folders of packages outside of the project, by name (``hoidata.datasets.kitchen``).
     """
 
@@ -60,10 +59,6 @@ class SourceTree:
 
         A data file that some choice names counts only if that choice's module is reached. All other data files count
         with their package. Third-party packages with entry points are listed with their version.
-
-        Args:
-            start: names of the modules to begin with.
-            chosen: the run-time choices of modules, by module.
         """
         reached = self._reached(start, chosen)
         sources = {name: source for name in reached if (source := self._source(name))}

@@ -39,7 +39,6 @@ def read_locks(root: Path, stage: str = "") -> dict[str, Locked]:
     """The last run of each stage by name; empty before the first run.
 
     Args:
-        root: the project folder.
         stage: reads only the lock file that has this stage, which is faster; "" reads all.
     """
     file = stage.rpartition(":")[0].removesuffix("yaml") + "lock" if ":" in stage else "dvc.lock"

@@ -112,7 +112,6 @@ def scan_files(root: Path, parts: Sequence[DatasetPart] | None = None) -> tuple[
     """Hash all raw files below ``root`` except images, videos and archives.
 
     Args:
-        root: the raw folder.
         parts: restricts the scan to files of these parts (``Adapter.parts``); None scans all files.
     """
     patterns = ["**"] if parts is None else [pattern for part in parts for pattern in part.patterns]
@@ -130,7 +129,6 @@ def _folders(root: Path, folder: str, patterns: list[tuple[str, ...]]) -> Iterat
     """All folders below root, as relative paths, with the sorted names of their data files that match a pattern.
 
     Args:
-        root: the raw folder.
         folder: the folder to walk, relative to root.
         patterns: the remaining path segments of each glob pattern; ``**`` matches everything below.
     """
@@ -178,8 +176,6 @@ def verify_files(root: Path, manifest: Manifest, parts: Sequence[DatasetPart] | 
     """The differences between the files below ``root`` and the manifest.
 
     Args:
-        root: the raw folder.
-        manifest: the expected files.
         parts: the same parts as for ``scan_files``.
     """
     listed, present = manifest.by_path, {entry.path: entry for entry in scan_files(root, parts)}

@@ -25,8 +25,6 @@ def build_provenance(root: Path, stage_name: str, facts: dict[str, Any]) -> dict
     outputs, and the raw files and frames of the clips.
 
     Args:
-        root: the project folder.
-        stage_name: the stage that calls this function.
         facts: of the stage itself: model, config, seed, clips by subset, synthetic.
     """
     graph = written_graph(root)

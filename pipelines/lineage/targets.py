@@ -47,9 +47,7 @@ def find_target(root: Path | None, path_or_digest: str, here: Path | None = None
     """The file with a path (relative to ``here``) or a digest.
 
     Args:
-        root: the project folder; None outside of a project.
         path_or_digest: a path, or the first eight or more characters of a digest.
-        here: the folder that paths are relative to; None for the current folder.
 
     Raises:
         BadInput: there is no such file, or no record of its inputs.

@@ -204,12 +204,10 @@ class _Comparison:
         if now != recorded:
             changes = "; ".join(value_changes(recorded, now))
             return Node("param", key, "changed", f"{changes}{self.as_committed(key, recorded)}")
-        if "params.yaml" in self.history.uncommitted and self.committed_params(key) != now:
+        is_edited = "params.yaml" in self.history.uncommitted
+        if is_edited and self.value_in(self.history.text("HEAD", "params.yaml"), key) != now:
             return Node("param", key, "uncommitted", str(recorded))
         return Node("param", key, "same", str(recorded))
-
-    def committed_params(self, key: str, commit: str = "HEAD") -> Any:
-        return self.value_in(self.history.text(commit, "params.yaml"), key)
 
     def value_in(self, text: bytes, key: str) -> Any:
         """A param in the text of another params.yaml, with today's profile; None if it is not there."""

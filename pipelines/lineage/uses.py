@@ -32,7 +32,6 @@ def uses(root: Path, source: str) -> list[Use]:
     samples and the recorded clips.
 
     Args:
-        root: the project folder.
         source: the path of a raw file or its end, a subject, an object, or a clip id.
     """
     locks = read_locks(root)

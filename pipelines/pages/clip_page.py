@@ -43,7 +43,6 @@ def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, h
 
     Args:
         annotated: the dataset of the clip, with the output of quality control next to it.
-        hands: the hand model of the store.
 
     Raises:
         MissingResource: quality control has not run; the message names its stage.

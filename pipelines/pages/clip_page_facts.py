@@ -39,10 +39,6 @@ class ClipSeries:
     hinge_rad: np.ndarray | None  # as in ``ObjectTrack``; None for a rigid object
     is_prismatic: bool  # whether it is in metres
 
-    def touched_count(self, side: Side) -> np.ndarray:
-        """(frame,) number of sampled points that this hand touches."""
-        return self.touched[side].sum(axis=1)
-
     @property
     def depth_m(self) -> dict[Side, np.ndarray] | None:
         """Per side (frame,) depth of the deepest hand vertex in the object; None if the object is not solid."""

@@ -67,7 +67,7 @@ class Timeline:
 def clip_charts(series: ClipSeries, sides: Sequence[Side], point_count: int) -> list[Chart]:
     """The charts of a clip page for the hands ``sides``."""
     threshold_cm = series.evidence.threshold_m * 100
-    touched = [Line(side, SIDE_COLOURS[side], series.touched_count(side).astype(float)) for side in sides]
+    touched = [Line(side, SIDE_COLOURS[side], series.touched[side].sum(axis=1).astype(float)) for side in sides]
     nearest = {side: np.where(np.isfinite(m), m, np.nan) for side, m in series.evidence.distance_m.items()}
     near = [Line(side, SIDE_COLOURS[side], nearest[side] * 100) for side in sides]
     charts = [

@@ -41,7 +41,7 @@ class DatasetFacts:
 
 def read_dataset(root: Path, name: str, hands: HandPair) -> DatasetFacts:
     """Facts of the dataset below ``root`` (its ``clips``, ``annotation``, ``contact`` and ``splits`` folders)."""
-    reason = reason_for_nothing(root / "clips")
+    reason = empty_reason(root / "clips")
     if not (root / "clips" / "meta" / "info.json").is_file():
         return DatasetFacts(name, empty=reason or "it was not converted")
     store = open_store(root / "clips", hands)
@@ -59,11 +59,6 @@ def read_dataset(root: Path, name: str, hands: HandPair) -> DatasetFacts:
         annotated=annotated,
         info=store.info,
     )
-
-
-def reason_for_nothing(folder: Path) -> str:
-    """The reason in ``folder/empty.json``; "" without that file."""
-    return empty_reason(folder) or ""
 
 
 def has_tables(root: Path, *tables: str) -> bool:

@@ -79,7 +79,6 @@ def write_dataset_page(
 
     Args:
         root: the folder with the outputs of the dataset's stages.
-        examples: the largest number of examples.
 
     Raises:
         MissingResource: the dataset has no clips, or a stage has not run; the message says which.

@@ -52,9 +52,7 @@ def write_generation(
     The same motions give the same bytes.
 
     Args:
-        hands: the hand model of the motions' parameters.
         checkpoints: the folder of the checkpoints, in words.
-        notes: shown at the top of the page.
     """
     files = []
     for motion in motions:

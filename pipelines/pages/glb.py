@@ -134,9 +134,7 @@ def write_glb(
     """Write ``clip`` as an animated, self-contained GLB; equal inputs give equal bytes.
 
     Args:
-        contact: colours the object.
         ghosts: transparent hands, for comparison with those of the clip.
-        extras: JSON values for the asset's ``extras``.
     """
     return write_whole(path, glb_bytes(clip, hands, contact, ghosts, extras))
 

@@ -66,9 +66,7 @@ def write_hands(
     """Write motion.npz, motion.glb (further motions: motion-1.npz, ...) and index.html; returns their paths.
 
     Args:
-        steps: the steps of the object trajectory.
         made_from: digests of the networks by file.
-        verdicts: the checks of each motion.
     """
     first, files = motions[0], []
     for motion in motions:

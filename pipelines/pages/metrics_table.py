@@ -224,9 +224,6 @@ def markdown_table(
 
     A cell has its 95 % interval over clips, and says if it is worse than a retrieval baseline. Reasons of methods that
     were not evaluated and of unmeasured metrics follow below the table. Raises BadInput for an unknown metric.
-
-    Args:
-        stale: methods whose metrics are older than an input, with that input.
     """
     files, by_name = _read_files(Path(folder), families), {metric.name: metric for metric in ALL_METRICS}
     stale = stale or {}

@@ -65,9 +65,7 @@ def write_motions(
     The same motions give the same bytes.
 
     Args:
-        meanings: descriptions of all arrays.
         colour_meaning: the meaning of the colours in the .glb.
-        values: variables of the template.
     """
     folder.mkdir(parents=True, exist_ok=True)
     paths = []

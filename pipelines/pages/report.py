@@ -8,11 +8,12 @@ from markupsafe import Markup
 
 from hoidata.clips.clip import Clip
 from hoidata.dataset_folders import dataset_title
+from hoidata.files.written import empty_reason
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.info import embedded_hand_warning
 from pipelines.pages.curves import Panel, log_curves, panels_svg, read_log
-from pipelines.pages.dataset_facts import DatasetFacts, read_dataset, reason_for_nothing
+from pipelines.pages.dataset_facts import DatasetFacts, read_dataset
 from pipelines.pages.dataset_page import can_be_shown, write_dataset_page
 from pipelines.pages.examples import first_motion, motion_contact, shown_ids, shown_subset, true_contact
 from pipelines.pages.metrics_table import CONTROLS, RETRIEVAL_BASELINES, MetricsTable, metrics_tables
@@ -113,7 +114,8 @@ def _section(name: str, folders: ReportFolders, families: Sequence[str], hands: 
     samples = folders.samples / name / families[0]
     motions, motion_facts = _motions(facts, hands, _sample_folders(folders.samples / name, families[0]))
     table = metrics_tables(folders.metrics / name, families)
-    trained = [folder.name for folder in networks if not reason_for_nothing(folder)]
+    reasons = {folder.name: empty_reason(folder) for folder in networks}
+    trained = [name for name, reason in reasons.items() if not reason]
     summary = dataset_summary(facts.annotated, trained, families[0], samples, table, hands)
     return Section(
         facts,
@@ -126,7 +128,7 @@ def _section(name: str, folders: ReportFolders, families: Sequence[str], hands: 
         contact=_contact_pairs(facts, hands, samples),
         table=table,
         curves=[chart for folder in networks if (chart := _loss_chart(name, folder.name, folder / "log.csv"))],
-        missing=[(folder.name, reason) for folder in networks if (reason := reason_for_nothing(folder))],
+        missing=[(name, reason) for name, reason in reasons.items() if reason],
         summary=summary,
         examples=_example_players(facts.annotated, summary, hands),
     )

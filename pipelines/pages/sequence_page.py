@@ -28,7 +28,6 @@ def write_sequence_page(path: str | Path, annotated: AnnotatedStore, sequence: s
     """Write the page of a sequence; equal inputs give equal bytes.
 
     Args:
-        annotated: the dataset of the sequence.
         sequence: its name without the dataset's, such as ``s01/box_use_01``; at least one clip is from it.
     """
     clips = sorted(

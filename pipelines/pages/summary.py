@@ -48,7 +48,6 @@ def dataset_summary(
     """The summary of one dataset.
 
     Args:
-        networks: names of the trained networks.
         family: the method of the examples, with its motions in ``samples``.
     """
     if annotated is None:

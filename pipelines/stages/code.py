@@ -67,7 +67,6 @@ def code_today(root: Path, only: Collection[str] | None = None) -> dict[str, dic
     """The content of the files of ``code/`` for the present code, by path (``code/convert/grab.json``).
 
     Args:
-        root: the project folder.
         only: paths of the files to compute; None for all.
     """
     plain = read_file(root / "params.yaml")
@@ -127,8 +126,6 @@ def profile_settings(plain: dict[str, Any], params: dict[str, Any], name: str) -
     """The settings of a file's stages, as JSON, if the chosen profile overrides them; else empty.
 
     Args:
-        plain: params.yaml without the profile's overlay.
-        params: params.yaml with the overlay.
         name: the file of ``code/``, without suffix.
     """
     settings = _settings_read(params, name)
@@ -142,15 +139,11 @@ def _settings_read(params: dict[str, Any], name: str) -> Any:
     stage, _, name_in_stage = name.partition("/")
     section = params.get(stage) or {}
     if stage == "train":
-        return section.get("seed"), *_network_settings(section, name_in_stage)
+        chosen = (section.get(str(section.get(kind))) or {} for kind in ("preset", "size"))
+        return section.get("seed"), *(settings.get(name_in_stage) for settings in chosen)
     if stage in SECTIONS_OF_DATASETS:
         return section.get("margin_frames")
     return (section, params.get("sample")) if stage == "controls" else section
-
-
-def _network_settings(section: dict[str, Any], network: str) -> list[Any]:
-    """The settings of a network in the chosen preset and size."""
-    return [(section.get(str(section.get(kind))) or {}).get(network) for kind in ("preset", "size")]
 
 
 def _chosen_by_dataset(tree: SourceTree, name: str) -> dict[str, list[Choice]]:

@@ -64,14 +64,31 @@ def run(paths: StagePaths) -> None:
 
 
 def train(paths: StagePaths) -> None:
-    """Run one of the processes that train ``paths.model``."""
-    settings = load_settings(TrainParams, "train")
-    params = settings.of(paths.model)
-    encoder = (read_params(Path()).get("annotate") or {}).get("encoder", AnnotationSettings.encoder)
+    """Run one of the processes that train ``paths.model`` and write its checkpoint."""
+    from models.common.repeatable import chosen_device, make_repeatable
+    from models.common.team import Team
+    from models.common.training import train_network
+
+    settings, params = load_settings(TrainParams, "train"), read_params(Path())
+    encoder = (params.get("annotate") or {}).get("encoder", AnnotationSettings.encoder)
     if settings.preset == "paper" and paths.model in SENTENCE_READERS and (note := not_clip_note(encoder)):
         print(f"{paths.model}: {note}")
-    code = Path("code", "train", f"{paths.model}.json")
-    train_into(paths.checkpoint, paths, params, paths.training, code)
+    network, code = load_network(paths.model), Path("code", "train", f"{paths.model}.json")
+    stage = producers(written_graph(Path()))[paths.checkpoint.as_posix()].name
+    make_repeatable(threads=1)  # other cores run other stages; ``train.processes`` sets the number for one network
+    train_network(
+        network,
+        paths.data,
+        paths.checkpoint,
+        settings.of(paths.model),
+        load_hands(paths.profile),
+        needed={load_network(name): paths.checkpoints / name for name in network.needs},
+        provenance=lambda facts: build_provenance(Path(), stage, facts),
+        device=Team.joined().device(chosen_device(params.get("device", "auto"))),
+        progress=paths.training,
+        code=sha256_file(code) if code.is_file() else "",
+        full_key=partial(full_key, network.name),
+    )
 
 
 def full_key(network: str, key: str, path: Path = Path("params.yaml")) -> str:
@@ -94,35 +111,3 @@ def _is_set(values: Any, names: Sequence[str]) -> bool:
             return False
         values = values[name]
     return True
-
-
-def train_into(out: Path, paths: StagePaths, params: Mapping[str, Any], progress: Path, code: Path) -> None:
-    """Train ``paths.model`` and write the checkpoint.
-
-    Args:
-        out: the folder of the checkpoint.
-        paths: of the stage run.
-        params: the settings of the network.
-        progress: the folder with the state of a killed training.
-        code: the file with the digests of the stage's code.
-    """
-    from models.common.repeatable import chosen_device, make_repeatable
-    from models.common.team import Team
-    from models.common.training import train_network
-
-    network = load_network(paths.model)
-    stage = producers(written_graph(Path()))[out.as_posix()].name
-    make_repeatable(threads=1)  # other cores run other stages; ``train.processes`` sets the number for one network
-    train_network(
-        network,
-        paths.data,
-        out,
-        params,
-        load_hands(paths.profile),
-        needed={load_network(name): paths.checkpoints / name for name in network.needs},
-        provenance=lambda facts: build_provenance(Path(), stage, facts),
-        device=Team.joined().device(chosen_device(read_params(Path()).get("device", "auto"))),
-        progress=progress,
-        code=sha256_file(code) if code.is_file() else "",
-        full_key=partial(full_key, network.name),
-    )

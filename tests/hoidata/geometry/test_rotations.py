@@ -6,7 +6,6 @@ from scipy.linalg import expm
 from hoidata.geometry.rotations import (
     canonical_rotvec,
     mirror_rotvec_x,
-    nearest_rotvec,
     rot6d_to_rotmat,
     rotmat_to_rot6d,
     rotmat_to_rotvec,
@@ -122,10 +121,3 @@ def test_canonical_axis_angles_are_the_same_rotations_of_at_most_pi_and_shorter_
     short = np.linalg.norm(vectors, axis=1) < 3.15
     assert result[short].tobytes() == vectors[short].tobytes()
     assert result.dtype == dtype
-
-
-def test_an_axis_angle_nearest_to_a_reference_is_the_same_rotation_across_pi():
-    degrees = np.deg2rad([[[179.0, 0, 0], [0, -179.0, 0], [0, 0, 30.0], [0, 0, 0]]])
-    reference = np.deg2rad([[[-179.0, 0, 0], [0, 178.0, 0], [0, 0, -20.0], [0, 0, 170.0]]])
-    expected = np.deg2rad([[[-181.0, 0, 0], [0, 181.0, 0], [0, 0, 30.0], [0, 0, 0]]])
-    np.testing.assert_allclose(nearest_rotvec(degrees, reference), expected, atol=1e-12)

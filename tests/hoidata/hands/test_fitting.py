@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.errors import BadInput
-from hoidata.hands import load_embedded_hands, track_joints
-from hoidata.hands.fitting import FitSettings, fit_hands, fit_shape
+from hoidata.hands import fitting, load_embedded_hands, track_joints
+from hoidata.hands.fitting import fit_hands, fit_shape
 
 N_FRAMES = 24
 MIRROR = np.array([-1.0, 1.0, 1.0])
@@ -102,9 +102,10 @@ def test_noise_does_not_twist_fingers_about_their_bones(keypoints: dict, betas: 
     assert fit.error_m.mean() < 0.008
 
 
-def test_equal_keypoints_give_equal_bytes(keypoints: dict) -> None:
-    quick = FitSettings(shape_frames=6, shape_steps=3)
-    first, second = (fit_hands(keypoints, HANDS, settings=quick)["left"] for _ in range(2))
+def test_equal_keypoints_give_equal_bytes(keypoints: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fitting, "SHAPE_FRAMES", 6)
+    monkeypatch.setattr(fitting, "SHAPE_STEPS", 3)
+    first, second = (fit_hands(keypoints, HANDS)["left"] for _ in range(2))
     assert first.hand_pose.tobytes() == second.hand_pose.tobytes()
 
 
@@ -116,14 +117,14 @@ def test_many_frames_of_another_skeleton_give_a_moderate_shape(keypoints: dict) 
     assert np.abs(fit_shape(stretched, HANDS)).max() < 4
 
 
-def test_keypoints_of_larger_weight_fit_better(keypoints: dict) -> None:
+def test_keypoints_of_larger_weight_fit_better(keypoints: dict, monkeypatch: pytest.MonkeyPatch) -> None:
     shifted = keypoints["right"].copy()
     shifted[:, 16:] += [0.0, 0.01, 0.0]
-    even, tips = (
-        fit_hands({"right": shifted}, HANDS, np.zeros(10), FitSettings(weights=(1.0,) * 16 + (weight,) * 5))["right"]
-        for weight in (1.0, 20.0)
-    )
-    assert tips.error_m[:, 16:].mean() < even.error_m[:, 16:].mean()
+    errors_m = []
+    for weight in (1.0, 20.0):
+        monkeypatch.setattr(fitting, "WEIGHTS", (1.0,) * 16 + (weight,) * 5)
+        errors_m.append(fit_hands({"right": shifted}, HANDS, np.zeros(10))["right"].error_m[:, 16:].mean())
+    assert errors_m[1] < errors_m[0]
 
 
 def test_keypoints_of_another_layout_are_refused() -> None:

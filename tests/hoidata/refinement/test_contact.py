@@ -197,7 +197,7 @@ def test_equal_input_gives_equal_bytes_and_a_clip_without_weight_is_refined(push
 
 def test_a_grasp_has_one_control_point_and_weights_sum_to_one():
     grasps = [(12, 36)]
-    weights = spline_weights(FRAMES, grasps, 5)  # pyright: ignore[reportArgumentType]
+    weights = spline_weights(FRAMES, grasps)  # pyright: ignore[reportArgumentType]
     assert weights.sum(axis=1) == pytest.approx(1)
     assert weights[12:36].max(axis=1) == pytest.approx(1)
     assert len(set(weights[12:36].argmax(axis=1))) == 1
