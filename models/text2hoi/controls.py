@@ -143,13 +143,13 @@ class RefinedControl:
         ]
 
     def _refined(self, request: Request, clip: Clip, contact_map: np.ndarray, surface: Surface) -> Clip:
-        """The clip with refined active hands; the object and the tracked frames stay as they are."""
+        """The clip with refined active hands; the object and the tracked frames are unchanged."""
         frame = request.world_from_model[:3, :3].T, request.world_from_model[:3, 3]
         hands = np.stack([hand_features(clip.hands[side].with_last_valid_pose(), *frame) for side in SIDES])
         features = hands, object_features(clip.object, *frame), contact_map[None].astype(np.float32)
-        given, objects, contact = (torch.from_numpy(array)[None].to(self.model.device) for array in features)
+        coarse, objects, contact = (torch.from_numpy(array)[None].to(self.model.device) for array in features)
         batch = collate_requests([request]).to(self.model.device)
-        moved = self.model.refine(batch, given, objects, contact, surface)[0]
+        moved = self.model.refine(batch, coarse, objects, contact, surface)[0]
         refined = self.model.refined_clip(request, moved, objects[0]).hands.items()
         tracks = {side: replace(track, valid=clip.hands[side].valid) for side, track in refined if track.valid.any()}
         return replace(clip, hands={**clip.hands, **tracks})
