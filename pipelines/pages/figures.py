@@ -1,4 +1,4 @@
-"""The illustrations of the Text2HOI paper (Cha et al. 2024), one page each, for a clip and the networks of its dataset."""
+"""The illustrations of the Text2HOI paper (Cha et al. 2024), one page each, for a clip and its dataset's networks."""
 
 import math
 from collections import Counter
