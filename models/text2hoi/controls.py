@@ -44,15 +44,15 @@ class OtherContact:
         return self.sample_with_targets(requests)[0]
 
     def sample_with_targets(self, requests: Sequence[Request]) -> tuple[Sequence[Clip | Skipped], list[np.ndarray]]:
-        own = self.model.contact_maps(requests)
-        given = [self.others.get(request.clip_id, mine) for request, mine in zip(requests, own, strict=True)]
-        made, _ = self.model.sample_with_targets(requests, contact_maps=given)
+        predicted = self.model.contact_maps(requests)
+        conditions = [self.others.get(request.clip_id, mine) for request, mine in zip(requests, predicted, strict=True)]
+        clips, _ = self.model.sample_with_targets(requests, contact_maps=conditions)
         reason = "no other test clip of its object has another contact map"
         answers = [
             clip if request.clip_id in self.others else Skipped(request.motion_id, reason)
-            for request, clip in zip(requests, made, strict=True)
+            for request, clip in zip(requests, clips, strict=True)
         ]
-        return answers, [contact_map.amax(0).numpy() > 0 for contact_map in own]
+        return answers, [contact_map.amax(0).numpy() > 0 for contact_map in predicted]
 
 
 @dataclass(frozen=True)
@@ -112,8 +112,8 @@ class RefinedRetrieval:
     pair: HandPair
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
-        found = self.retrieval.sample(requests)
-        return [refine_grasps(self.pair, clip) if isinstance(clip, Clip) else clip for clip in found]
+        clips = self.retrieval.sample(requests)
+        return [refine_grasps(self.pair, clip) if isinstance(clip, Clip) else clip for clip in clips]
 
 
 def _refined(retrieval: Family) -> Family:
@@ -143,13 +143,13 @@ class RefinedControl:
         ]
 
     def _refined(self, request: Request, clip: Clip, contact_map: np.ndarray, surface: Surface) -> Clip:
-        """The clip with refined active hands; the object and the tracked frames stay as they are."""
+        """The clip with refined active hands; the object and the tracked frames are unchanged."""
         frame = request.world_from_model[:3, :3].T, request.world_from_model[:3, 3]
         hands = np.stack([hand_features(clip.hands[side].with_last_valid_pose(), *frame) for side in SIDES])
         features = hands, object_features(clip.object, *frame), contact_map[None].astype(np.float32)
-        given, objects, contact = (torch.from_numpy(array)[None].to(self.model.device) for array in features)
+        coarse, objects, contact = (torch.from_numpy(array)[None].to(self.model.device) for array in features)
         batch = collate_requests([request]).to(self.model.device)
-        moved = self.model.refine(batch, given, objects, contact, surface)[0]
+        moved = self.model.refine(batch, coarse, objects, contact, surface)[0]
         refined = self.model.refined_clip(request, moved, objects[0]).hands.items()
         tracks = {side: replace(track, valid=clip.hands[side].valid) for side, track in refined if track.valid.any()}
         return replace(clip, hands={**clip.hands, **tracks})

@@ -28,7 +28,7 @@ def show(
         str, typer.Option(help="Profile: embedded, study or own. Default: the one in params.yaml.")
     ] = "",
     data: Data = None,
-    figures: Annotated[bool, typer.Option("--figures", help="The figures of Text2HOI instead.")] = False,
+    figures: Annotated[bool, typer.Option("--figures", help="The illustrations of Text2HOI instead.")] = False,
 ) -> None:
     """Write a self-contained web page about a clip or a dataset."""
     if data is not None and not figures:

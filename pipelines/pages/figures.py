@@ -1,4 +1,4 @@
-"""The figures of the Text2HOI paper (Cha et al. 2024), one page each, for a clip and the networks of its dataset."""
+"""The illustrations of the Text2HOI paper (Cha et al. 2024), one page each, for a clip and its dataset's networks."""
 
 import math
 from collections import Counter
@@ -42,7 +42,7 @@ from pipelines.stages.base import StagePaths, empty_reason
 from pipelines.stages.families import families_of
 
 PROMPTS, SAMPLES = 4, 4
-SIZES = (0.6, 1.0, 1.6)  # of the object, relative to its own; the contact network is trained on .5 to 2
+SIZES = (0.6, 1.0, 1.6)  # of the object, relative to the original; the contact network is trained on .5 to 2
 PERTURBED = ("noise", "noise-refined", "pressed", "pressed-refined")
 REFINED_CLIPS = 40  # test clips that are perturbed and refined
 REFINER_METRICS = tuple(map(metric, ("realism_si", "realism_released", "penetration_mm", "deep_share")))
@@ -50,7 +50,7 @@ REFINER_METRICS = tuple(map(metric, ("realism_si", "realism_released", "penetrat
 
 @dataclass(frozen=True)
 class Panel:
-    """One motion of a figure."""
+    """One motion of a page."""
 
     caption: str
     players: list[Player]  # one, or a contact map and the motion
@@ -72,7 +72,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Subject:
-    """The clip whose prompt and object the figures use, and the networks."""
+    """The clip whose prompt and object the pages use, and the networks."""
 
     annotated: AnnotatedStore
     clip_id: str
@@ -94,7 +94,7 @@ class Subject:
         return english_sentences(verb, self.clip.object_words, hand)[0]
 
     def generate(self, prompt: str, samples: int = 1, size: float = 1.0) -> list[GeneratedMotion]:
-        """Motions of seed 0 for a prompt; ``size``: of the object, relative to its own."""
+        """Motions of seed 0 for a prompt; ``size``: of the object, relative to the original."""
         model = self.clip.object.model
         is_known = not self.generator.object_ups or model.name in self.generator.object_ups
         hinge = model.hinge and replace(model.hinge, origin_m=model.hinge.origin_m * size)
@@ -117,7 +117,7 @@ class Subject:
 
 
 def write_figures(name: str, profile: str, out: Path) -> list[Path]:
-    """Write the figures of a clip, or of a held-out clip of a dataset, below ``out``; returns the pages.
+    """Write the pages of a clip, or of a held-out clip of a dataset, below ``out``; returns their paths.
 
     Raises BadInput for an unknown name or a clip without a sentence, and MissingResource if a stage has not run.
     """
@@ -135,7 +135,7 @@ def write_figures(name: str, profile: str, out: Path) -> list[Path]:
 
 
 def write_pages(folder: Path, subject: Subject) -> list[Path]:
-    """Write one page per figure; equal inputs give equal bytes."""
+    """Write all pages; equal inputs give equal bytes."""
     figures = [_methods(subject), *_generated(subject), _refined(subject), _frames(subject)]
     values = {
         "links": [(figure.name, f"{figure.source}: {figure.name}") for figure in figures],
@@ -169,7 +169,7 @@ def _methods(subject: Subject) -> Figure:
 
 
 def _generated(subject: Subject) -> list[Figure]:
-    """The figures that compare generated motions."""
+    """The pages that compare generated motions."""
     hand_prompts = [subject.prompt_of(subject.clip_id, hand) for hand in HAND_TYPES]
     by_prompt = {text: subject.generate(text)[0] for text in _prompts(subject)}
     by_hand = {text: subject.generate(text)[0] for text in hand_prompts}
@@ -178,13 +178,13 @@ def _generated(subject: Subject) -> list[Figure]:
     maps = "The predicted contact map and the motion for"
     training, sizes = "the prompts of training clips with the same object", "smaller or larger copies of the object"
     hands = "one verb and object with the left hand, the right hand and both"
-    rows = (
+    pages = (
         ("prompts", "Fig. 5, S4", "Contact map and motion by prompt", f"{maps} {training}.", by_prompt),
         ("sizes", "Fig. S5", "Contact map and motion by size of the object", f"{maps} {sizes}.", by_size),
         ("samples", "Fig. S8", "Diversity: samples of one prompt", f"{maps} several samples of one prompt.", by_sample),
         ("hands", "Fig. S10", "Left hand, right hand, both", f"{maps} {hands}.", by_hand),
     )
-    return [_of_motions(subject, *row) for row in rows]
+    return [_of_motions(subject, *page) for page in pages]
 
 
 def _prompts(subject: Subject) -> list[str]:
@@ -200,7 +200,7 @@ def _prompts(subject: Subject) -> list[str]:
 def _of_motions(
     subject: Subject, name: str, source: str, title: str, words: str, motions: Mapping[str, GeneratedMotion]
 ) -> Figure:
-    """A figure of generated motions by caption: contact map and motion of each, and a table."""
+    """A page of generated motions by caption: contact map and motion of each, and a table."""
     panels, rows, first = [], [], next(iter(motions.values()))
     for caption, motion in motions.items():
         shown = shown_motion(motion, subject.generator.hands, caption)

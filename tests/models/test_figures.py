@@ -1,4 +1,4 @@
-"""The figures of Text2HOI as pages: each holds the motions, maps and numbers of its figure."""
+"""The illustrations of Text2HOI as pages: each holds its motions, contact maps and numbers."""
 
 import re
 from dataclasses import replace
@@ -36,7 +36,7 @@ def subject(annotated: AnnotatedStore, trained: Path, tmp_path: Path, monkeypatc
     return Subject(annotated, annotated.ids("test")[0], generator, paths, ("mean-motion", "mean-pose", "ground-truth"))
 
 
-def test_each_page_holds_the_motions_of_its_figure(subject):
+def test_each_page_holds_its_motions(subject):
     pages = {path.stem: path.read_text() for path in write_pages(Path("pages"), subject)}
     left, right, both = (f"Lift a box with {words}." for words in ("the left hand", "the right hand", "both hands"))
     refined = [
