@@ -50,7 +50,7 @@ class Row:
     title: str
     run: str
     family: str
-    reference: str = ""  # the title of the row that this one is compared with
+    reference: str = ""  # the title of the line that this one is compared with
 
     def of(self, results: Results) -> list[Mapping[str, Any]]:
         """The results of the run by seed."""
@@ -134,19 +134,19 @@ class PaperTable:
     def markdown(self, results: Results) -> str:
         """The tables of the runs, their order, and the paper's numbers."""
         parts = [f"{self.content['budget']} {LEGEND}"]
-        minutes = {row: self.minutes(row, results) for row in self.rows}
+        minutes = {line: self.minutes(line, results) for line in self.rows}
         for title, columns in self.content["columns"].items():
             lines = [
-                [row.title, *(cell(row, results, METRIC[name]) for name in columns.values()), minutes[row]]
-                for row in self.rows
+                [line.title, *(cell(line, results, METRIC[name]) for name in columns.values()), minutes[line]]
+                for line in self.rows
             ]
             head = ["method", *columns, "processor minutes, training + sampling"]
             parts.append(f"{title}:\n\n{markdown_lines(head, lines)}")
-        if any(row.reference for row in self.rows):
+        if any(line.reference for line in self.rows):
             parts.append(f"Difference from the reference row:\n\n{self.differences(results)}")
         if paper := self.content.get("paper"):
             methods = paper["methods"][self.dataset]
-            values = {row.title: seeds for row in self.rows if (seeds := row.values(results, ORDERED_BY))}
+            values = {line.title: seeds for line in self.rows if (seeds := line.values(results, ORDERED_BY))}
             here = sorted(values, key=lambda title: -mean_value(values[title]))
             theirs = sorted(methods, key=lambda name: -methods[name][0])
             parts.append(f"Order by top-3 accuracy: {' > '.join(here)}. In the paper: {' > '.join(theirs)}.")
@@ -154,24 +154,24 @@ class PaperTable:
             parts += [paper["reasons"], markdown_lines(["paper", *paper["columns"]], lines)]
         return "\n\n".join(part.rstrip() for part in parts) + "\n"
 
-    def minutes(self, row: Row, results: Results) -> str:
+    def minutes(self, line: Row, results: Results) -> str:
         """Processor minutes of all trainings of the row's package and of its sampling, mean over seeds."""
-        graph, sums = f"models/{family_module(row.family).split('.')[1]}/dvc.yaml", []
-        sample = f"{graph}:sample@{self.settings['profile']}-{self.dataset}-{row.family}"
-        for seconds in (content["seconds"] for content in row.of(results)):
+        graph, sums = f"models/{family_module(line.family).split('.')[1]}/dvc.yaml", []
+        sample = f"{graph}:sample@{self.settings['profile']}-{self.dataset}-{line.family}"
+        for seconds in (content["seconds"] for content in line.of(results)):
             trained = sum(value for stage, value in seconds.items() if stage.startswith(f"{graph}:train"))
             sums += [(trained / 60, seconds[sample] / 60)] if sample in seconds else []
         return " + ".join(f"{mean(values):.1f}" for values in zip(*sums, strict=True)) or "–"
 
     def differences(self, results: Results) -> str:
         """Per row and column of the first table, the difference from the reference row."""
-        columns, rows = next(iter(self.content["columns"].values())), {row.title: row for row in self.rows}
-        recorded = next(row for row in self.rows if row.family == RECORDED)
+        columns, rows = next(iter(self.content["columns"].values())), {line.title: line for line in self.rows}
+        recorded = next(line for line in self.rows if line.family == RECORDED)
         lines = []
-        for row in (row for row in self.rows if row.reference):
-            lines.append([row.title, row.reference])
+        for line in (line for line in self.rows if line.reference):
+            lines.append([line.title, line.reference])
             for name in columns.values():
-                seeds = [one.values(results, name) for one in (row, rows[row.reference], recorded)]
+                seeds = [one.values(results, name) for one in (line, rows[line.reference], recorded)]
                 lines[-1].append(difference(METRIC[name], *seeds))
         return markdown_lines(["row", "reference", *columns], lines)
 
@@ -186,11 +186,11 @@ def half_width(seeds: Seeds, kind: str) -> float | None:
     return mean((high - low) / 2 for low, high in intervals) if intervals else None
 
 
-def cell(row: Row, results: Results, metric: AnyMetric) -> str:
-    """Mean over seeds with the intervals of ``LEGEND``, or the reason why there is no value."""
-    seeds = row.values(results, metric.name)
+def cell(line: Row, results: Results, metric: AnyMetric) -> str:
+    """Mean over seeds with the intervals of ``LEGEND``, or the reason for a missing value."""
+    seeds = line.values(results, metric.name)
     if not seeds:
-        return row.reason(results, metric.name)
+        return line.reason(results, metric.name)
     text, values = number(mean_value(seeds)), {seed["value"] for seed in seeds}
     if half := half_width(seeds, "repetitions"):
         text += f" ± {number(half)}"
@@ -206,7 +206,7 @@ def difference(metric: AnyMetric, seeds: Seeds, others: Seeds, recorded: Seeds) 
     """
     if not (seeds and others):
         return NOT_MEASURED
-    halves = [half_width(row, "repetitions") or half_width(row, "clips") or 0.0 for row in (seeds, others)]
+    halves = [half_width(line, "repetitions") or half_width(line, "clips") or 0.0 for line in (seeds, others)]
     value, other, half = mean_value(seeds), mean_value(others), sum(one**2 for one in halves) ** 0.5
     better = is_better(metric, value, other, mean_value(recorded) if recorded else None)
     verdict = "" if abs(value - other) <= half or better is None else ", better" if better else ", worse"

@@ -38,10 +38,10 @@ def test_settings_of_every_run_fit_a_project_and_its_rows_are_sampled(table, tmp
         build_config(SamplingConfig, params["sample"]["text2hoi"], "sample")
         assert train.seed == int(name.split()[-1])
         sampled[name.rpartition(" ")[0]] = {*families_of(params, table.dataset), *params["controls"]["families"]}
-    titles = [row.title for row in table.rows]
-    assert all(row.family in sampled[row.run] and load_family(row.family) for row in table.rows)
-    assert all(row.reference in titles for row in table.rows if row.reference)
-    assert {row.family for row in table.rows} >= {RECORDED, "static"}
+    titles = [line.title for line in table.rows]
+    assert all(line.family in sampled[line.run] and load_family(line.family) for line in table.rows)
+    assert all(line.reference in titles for line in table.rows if line.reference)
+    assert {line.family for line in table.rows} >= {RECORDED, "static"}
     assert table.metrics <= set(METRIC)
 
 
@@ -56,7 +56,7 @@ def test_every_run_of_table_2_changes_another_part():
     table = PaperTable("table2", "study")
     changes = [json.dumps(settings["train"], sort_keys=True) for settings in table.runs().values()]
     assert len(set(changes)) == len(changes)
-    assert {row.run for row in table.rows} == set(table.content["runs"])
+    assert {line.run for line in table.rows} == set(table.content["runs"])
 
 
 def test_an_unknown_corpus_is_refused():
@@ -70,7 +70,7 @@ REPETITIONS = {0: [0.4, 0.5, 0.6], 1: [0.7, 0.8, 0.6]}  # accuracies by seed
 def method(values: list[float], **parts: dict) -> dict:
     """A method's metrics with a top-1 accuracy of these repetitions."""
     name = ACCURACY.name
-    intervals = {name: {"repetitions": list(t_interval(values)), "clips": [0.1, 0.9]}}
+    intervals = {name: {"repetitions": list(t_interval(values) or ()), "clips": [0.1, 0.9]}}
     content = {"figures": {name: sum(values) / len(values)}, "intervals": intervals, "notes": {}, "unmeasured": {}}
     return content | parts
 
@@ -92,11 +92,11 @@ def test_a_cell_has_the_mean_the_interval_over_repetitions_and_the_spread_over_s
 def test_a_cell_without_repetitions_has_the_interval_over_clips_and_one_without_value_the_reason():
     single = {"figures": {FID.name: 2.0}, "intervals": {FID.name: {"clips": [1.0, 3.0]}}}
     missing = {"figures": {}, "intervals": {}, "notes": {FID.name: "N too small"}}
-    row = Row("static", "ours", "static")
-    assert cell(row, results(static=single), FID) == "2.00 (1.00 to 3.00)"
-    assert cell(row, results(static=missing), FID) == "N too small"
-    assert cell(row, results(static={"empty": "not trained"}), FID) == "not trained"
-    assert cell(row, results(), FID) == "not measured"
+    line = Row("static", "ours", "static")
+    assert cell(line, results(static=single), FID) == "2.00 (1.00 to 3.00)"
+    assert cell(line, results(static=missing), FID) == "N too small"
+    assert cell(line, results(static={"empty": "not trained"}), FID) == "not trained"
+    assert cell(line, results(), FID) == "not measured"
 
 
 @pytest.mark.parametrize(
@@ -115,8 +115,8 @@ def test_the_command_fails_if_the_static_control_is_as_good_as_the_recordings(
     accuracy, code, tmp_path, monkeypatch, capsys
 ):
     recorded = method([0.5, 0.52]) | {"intervals": {ACCURACY.name: {"clips": [0.4, 0.6]}}}
-    made = results(static=method(accuracy), **{RECORDED: recorded})
-    monkeypatch.setattr(PaperTable, "fill", lambda table, project: made)
+    content = results(static=method(accuracy), **{RECORDED: recorded})
+    monkeypatch.setattr(PaperTable, "fill", lambda table, project: content)
     monkeypatch.setenv("HOIDATA_BENCH_OUT", str(tmp_path))
     assert make("table1", "embedded") == code
     assert ("static does not fall in accuracy_top1_paper" in capsys.readouterr().err) == bool(code)
@@ -126,8 +126,8 @@ def test_the_command_fails_if_the_static_control_is_as_good_as_the_recordings(
 
 
 def test_runs_that_are_in_the_results_with_the_same_settings_are_not_made_again(tmp_path, monkeypatch):
-    made, table = [], PaperTable("table1", "embedded")
-    monkeypatch.setattr(paper_tables, "open_project", lambda folder, settings: made.append(settings["train"]["seed"]))
+    seeds, table = [], PaperTable("table1", "embedded")
+    monkeypatch.setattr(paper_tables, "open_project", lambda folder, settings: seeds.append(settings["train"]["seed"]))
     monkeypatch.setattr(paper_tables, "reproduce", lambda folder, target: None)
     monkeypatch.setattr(paper_tables, "results_of", lambda folder, names: {})
     first = table.fill(tmp_path)
@@ -135,7 +135,7 @@ def test_runs_that_are_in_the_results_with_the_same_settings_are_not_made_again(
     assert table.fill(tmp_path) == first
     table.content["runs"]["paper"]["device"] = "cpu"
     table.fill(tmp_path)
-    assert made == [0, 0, 1, 1, 0, 1]
+    assert seeds == [0, 0, 1, 1, 0, 1]
 
 
 @pytest.mark.long
@@ -164,11 +164,11 @@ def test_a_table_is_made_from_a_whole_run(tmp_path, monkeypatch, project_tools):
     del table.content["runs"]["paper"]
     for name in [name for name in os.environ if name.startswith("HOIDATA_")]:
         monkeypatch.delenv(name)
-    made = table.fill(project)
-    methods = made["ours 0"]["methods"]
+    finished = table.fill(project)
+    methods = finished["ours 0"]["methods"]
     for family in ("text2hoi", "text2hoi-coarse", "mdm", "static", "prompt-retrieval", RECORDED):
         assert methods[family]["figures"][ACCURACY.name] >= 0
     assert methods["text2hoi"]["intervals"]["multimodality_released_paper"]["repetitions"]
-    assert table.fill(project) == made
-    lines = table.markdown(made).splitlines()
+    assert table.fill(project) == finished
+    lines = table.markdown(finished).splitlines()
     assert next(line for line in lines if line.startswith("| MDM |")).split(" | ")[-1] != "– |"
