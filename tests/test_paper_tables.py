@@ -15,6 +15,7 @@ from bench.project import write_params
 from hoidata.errors import BadInput
 from hoidata.metrics.intervals import t_interval
 from hoidata.settings import build_config, merge_settings
+from models.common.training import TrainingConfig
 from models.registry import NETWORKS, load_family, load_network
 from models.text2hoi.sampler import SamplingConfig
 from pipelines.expected_orderings import RECORDED
@@ -34,7 +35,11 @@ def test_settings_of_every_run_fit_a_project_and_its_rows_are_sampled(table, tmp
         params = read_params(tmp_path)
         train = build_config(TrainParams, params["train"], "params.yaml: train")
         for network in map(load_network, NETWORKS):
-            build_config(network.config, train.of(network.name).get("network", {}), network.name)
+            parts = {"network": network.config, "loss": network.loss, "training": TrainingConfig}
+            for part, kind in parts.items():
+                chosen = train.of(network.name).get(part, {})
+                assert kind is None or build_config(kind, chosen, f"{network.name}.{part}")
+                assert kind is not None or not chosen
         build_config(SamplingConfig, params["sample"]["text2hoi"], "sample")
         assert train.seed == int(name.split()[-1])
         sampled[name.rpartition(" ")[0]] = {*families_of(params, table.dataset), *params["controls"]["families"]}
@@ -139,14 +144,14 @@ def test_runs_that_are_in_the_results_with_the_same_settings_are_not_made_again(
 
 
 @pytest.mark.long
-def test_a_table_is_made_from_a_whole_run(tmp_path, monkeypatch, project_tools):
+def test_a_table_is_made_from_a_whole_run(tmp_path, monkeypatch):
     project = tmp_path / "project"
     subprocess.run([sys.executable, "-m", "hoidata", "init", str(project)], check=True)
     for path in (project / "manifests/embedded").glob("*.json"):
         path.write_text(path.read_text().replace('"size": "full"', '"size": "small"'))
     table = PaperTable("table1", "embedded")
     budget = {"training": {"steps": 2, "batch": 4, "validate_every": 1}}
-    tiny = {name: budget for name in table.settings["train"]["small"]}
+    tiny = {name: budget for name in table.content["settings"]["train"]["small"]}
     settings = {
         "annotate": {"encoder": "hash"},
         "evaluator": {"networks": ["paper"], "most_steps": 2},
@@ -166,9 +171,8 @@ def test_a_table_is_made_from_a_whole_run(tmp_path, monkeypatch, project_tools):
         monkeypatch.delenv(name)
     finished = table.fill(project)
     methods = finished["ours 0"]["methods"]
-    for family in ("text2hoi", "text2hoi-coarse", "mdm", "static", "prompt-retrieval", RECORDED):
-        assert methods[family]["figures"][ACCURACY.name] >= 0
-    assert methods["text2hoi"]["intervals"]["multimodality_released_paper"]["repetitions"]
+    assert all(methods[family]["figures"] for family in ("text2hoi", "text2hoi-coarse", "mdm", "static", RECORDED))
+    assert methods["mdm"]["intervals"]["multimodality_released_paper"]["repetitions"]
     assert table.fill(project) == finished
     lines = table.markdown(finished).splitlines()
     assert next(line for line in lines if line.startswith("| MDM |")).split(" | ")[-1] != "– |"
