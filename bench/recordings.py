@@ -5,14 +5,10 @@ HOIDATA_BENCH_OUT: the project folder (.hoidata/recordings). It becomes an ordin
 ``recordings.yaml``; `hoidata repro` continues an interrupted run. The tables are in ``benchmark.md`` of the project.
 """
 
-import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
-from hoidata.errors import MissingResource
-from hoidata.settings import merge_settings
+from bench.project import markdown_lines, open_project, reproduce, stage_runs
 from pipelines.pages.metrics_table import markdown_table
 from pipelines.params import load_yaml
 
@@ -32,30 +28,13 @@ TABLES = {
 
 def main() -> None:
     """Make or continue the project, and write ``benchmark.md``. Raises MissingResource if a variable is not set."""
-    raw = {name: os.environ.get(f"HOIDATA_{name.upper()}") for name in ("mano", "arctic")}
-    if missing := [name.upper() for name, root in raw.items() if not root]:
-        raise MissingResource(f"set HOIDATA_{missing[0]} to the folder of these files, as docs/own-data.md says")
     project = Path(os.environ.get("HOIDATA_BENCH_OUT", ".hoidata/recordings")).resolve()
-    if not (project / "dvc.yaml").is_file():
-        _hoidata("init", str(project), folder=Path.cwd())
-    merge_params(project / "params.yaml")
-    for name, root in raw.items():
-        _hoidata("raw", "scan", name, "--root", str(root), folder=project)
-    _hoidata("repro", folder=project)
+    open_project(project, load_yaml(SETTINGS.read_bytes()))
+    reproduce(project)
     text = "\n".join(f"## {title}\n\n{table(project / METRICS, names.split())}" for title, names in TABLES.items())
     text += f"\n## Time and memory of each stage\n\n{stage_table(project)}\n"
     (project / "benchmark.md").write_text(text)
     print(text)
-
-
-def _hoidata(*words: str, folder: Path) -> None:
-    subprocess.run([sys.executable, "-m", "hoidata", *words], cwd=folder, check=True)
-
-
-def merge_params(path: Path) -> None:
-    """Merge the settings of the benchmark into a project's params.yaml; a second time changes nothing."""
-    values = merge_settings(load_yaml(path.read_bytes()), load_yaml(SETTINGS.read_bytes()))
-    path.write_text(json.dumps(values, indent=1, ensure_ascii=False))  # JSON is YAML
 
 
 def table(metrics: Path, names: list[str]) -> str:
@@ -65,8 +44,10 @@ def table(metrics: Path, names: list[str]) -> str:
 
 def stage_table(project: Path) -> str:
     """A Markdown table: per stage of the project the wall time and processor time, seconds, the peak memory."""
-    rows = ["| stage | wall, s | processor, s | memory, MiB |", "|---|---|---|---|"]
-    runs = [json.loads(path.read_text()) for path in (project / ".hoidata/runs").glob("*.json")]
-    for run in sorted(runs, key=lambda run: run["began_at"]):
-        rows.append(f"| {run['stage']} | {run['seconds']:.0f} | {run['processor_seconds']:.0f} | {run['peak_mib']} |")
-    return "\n".join(rows)
+    return markdown_lines(
+        ["stage", "wall, s", "processor, s", "memory, MiB"],
+        [
+            [run["stage"], f"{run['seconds']:.0f}", f"{run['processor_seconds']:.0f}", str(run["peak_mib"])]
+            for run in stage_runs(project)
+        ],
+    )

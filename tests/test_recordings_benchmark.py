@@ -1,23 +1,28 @@
 """The settings of the benchmark on real recordings fit a project, and its metrics exist."""
 
-from bench.recordings import SETTINGS, TABLES, merge_params, stage_table
-from hoidata.package_paths import FOLDER
+from bench.project import write_params
+from bench.recordings import SETTINGS, TABLES, stage_table
 from hoidata.settings import merge_settings
 from models.registry import load_family
 from pipelines.pages.metrics_table import ALL_METRICS
 from pipelines.params import load_yaml, read_params
 
 
-def test_merged_settings_are_those_of_the_chosen_profile_and_a_second_merge_changes_nothing(tmp_path):
-    path = tmp_path / "params.yaml"
-    path.write_bytes((FOLDER / "params.yaml").read_bytes())
-    merge_params(path)
-    once, params, settings = path.read_bytes(), read_params(tmp_path), load_yaml(SETTINGS.read_bytes())
-    merge_params(path)
-    assert path.read_bytes() == once
+def test_merged_settings_are_those_of_the_chosen_profile_whatever_the_file_had(tmp_path):
+    path, settings = tmp_path / "params.yaml", load_yaml(SETTINGS.read_bytes())
+    path.write_text("profile: study\nsample: {samples: 7}\n")
+    write_params(path, settings)
+    params = read_params(tmp_path)
     assert params["profile"] == "own"
     for section in ("split", "sample", "train", "controls", "evaluate"):
         assert merge_settings(params[section], settings[section]) == params[section]
+
+
+def test_the_overlay_of_the_profile_comes_before_the_settings(tmp_path):
+    write_params(tmp_path / "params.yaml", {"profile": "study", "sample": {"samples": 3}})
+    params = read_params(tmp_path)
+    assert params["sample"]["samples"] == 3
+    assert params["convert"]["adapters"]["grab"] == {"margin_frames": 15}
 
 
 def test_every_control_is_a_family_and_every_metric_exists():

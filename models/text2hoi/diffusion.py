@@ -84,6 +84,8 @@ class DiffusionConfig:
     verbs: tuple[str, ...] = ()
     # Position codes count to the end of the motion as well.
     frames_to_go: bool = False
+    # Inputs that are zero, for the rows of Text2HOI's Table 2.
+    zero_inputs: tuple[Literal["contact_map", "scale", "frame_codes", "agent_codes"], ...] = ()
 
 
 def is_paper(config: DiffusionConfig) -> bool:
@@ -196,7 +198,12 @@ class DiffusionModel(nn.Module):
         points, scale = self.config.point_net.normalised(batch.points_m, batch.scale_m)
         with torch.no_grad():
             feature = self.object_net.eval()(points)[0]
-        return self.object_condition_in(torch.cat((feature, contact.float().amax(1), scale), -1))
+        inputs = feature, self._used(contact.float().amax(1), "contact_map"), self._used(scale, "scale")
+        return self.object_condition_in(torch.cat(inputs, -1))
+
+    def _used(self, values: Tensor, name: str) -> Tensor:
+        """The input, or zeros."""
+        return torch.zeros_like(values) if name in self.config.zero_inputs else values
 
     def denoise(self, hands: Tensor, objects: Tensor, timesteps: Tensor, condition: EncodedCondition) -> Motion:
         """``forward`` with an encoded condition."""
@@ -230,12 +237,12 @@ class DiffusionModel(nn.Module):
         config, width = self.config, self.config.transformer.width
         token_frames = self.hand_points_per_token * max(1, config.motion.knot_frames)
         frame = torch.arange(max(n_tokens), device=lengths.device) * token_frames
-        codes = sinusoid(frame, width).expand(len(lengths), -1, -1)
+        codes = self._used(sinusoid(frame, width), "frame_codes").expand(len(lengths), -1, -1)
         if self.to_go_in is not None:
             to_go = (lengths[:, None] - frame).clamp_min(0)
             progress = frame * MAX_FRAMES / lengths[:, None]
             codes = codes + self.to_go_in(torch.cat((sinusoid(to_go, width), sinusoid(progress, width)), -1))
-        agents = agent_codes(width, lengths.device)
+        agents = self._used(agent_codes(width, lengths.device), "agent_codes")
         return torch.cat([codes[:, :n] + agents[agent] for agent, n in zip((*sides, 2), n_tokens, strict=True)], 1)
 
 

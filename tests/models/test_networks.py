@@ -95,6 +95,27 @@ def test_padding_and_absent_hands_change_no_output(batch: ClipBatch, setting: st
     assert torch.equal(before[1][object_mask], after[1][object_mask])
 
 
+@pytest.mark.parametrize("name", ["contact_map", "scale"])
+@pytest.mark.parametrize("is_zero", [False, True])
+def test_an_input_that_is_zero_changes_no_output(batch: ClipBatch, name: str, is_zero: bool) -> None:
+    torch.manual_seed(0)
+    model = DiffusionModel(DiffusionConfig(SMALL, POINT_NET, zero_inputs=(name,) if is_zero else ())).eval()
+    condition, steps = condition_of(batch), torch.tensor([10, 500, 900])
+    other_batch = replace(batch, points_m=batch.points_m * 2, scale_m=batch.scale_m * 2)
+    other = replace(condition, **({"batch": other_batch} if name == "scale" else {"contact": ~condition.contact}))
+    with torch.no_grad():
+        outputs = [model(*points_of(batch, model), steps, one)[1] for one in (condition, other)]
+    assert torch.equal(*outputs) == is_zero
+
+
+def test_position_codes_that_are_zero_are_equal_for_all_frames_or_agents() -> None:
+    for zero_inputs in ((), ("frame_codes",), ("agent_codes",), ("frame_codes", "agent_codes")):
+        model = DiffusionModel(DiffusionConfig(SMALL, POINT_NET, zero_inputs=zero_inputs))
+        codes = model._codes(torch.tensor([40]), [4, 4, 4], (0, 1))[0].unflatten(0, (3, 4))  # by agent and frame
+        assert torch.allclose(codes, codes[:, :1], atol=1e-6) == ("frame_codes" in zero_inputs)
+        assert torch.allclose(codes, codes[:1], atol=1e-6) == ("agent_codes" in zero_inputs)
+
+
 def test_each_setting_changes_only_its_part_of_the_weights() -> None:
     """Names of the weights that one setting adds, removes or reshapes."""
     paper_shapes = shapes(DiffusionConfig(SMALL, POINT_NET))

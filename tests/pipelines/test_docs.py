@@ -2,9 +2,11 @@
 
 import contextlib
 import io
+import json
 import os
 import re
 import shlex
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import module_from_spec, spec_from_file_location
@@ -15,6 +17,7 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
+from hoidata.errors import BadInput
 from pipelines.cli import app
 
 PROJECT = Path(__file__).parents[2]
@@ -35,7 +38,7 @@ def docs_tool(name: str) -> Any:
     return module
 
 
-plain_words = docs_tool("plain_words")
+plain_words, results = docs_tool("plain_words"), docs_tool("results")
 
 
 @dataclass(frozen=True)
@@ -125,3 +128,42 @@ def test_plain_words_counts_names_comments_docstrings_and_markdown_outside_of_co
 def test_the_words_allowed_by_the_word_count_are_in_the_glossary():
     glossary = (PROJECT / "ARCHITECTURE.md").read_text().partition("## Glossary")[2].lower()
     assert {word for word in plain_words.ALLOWED if f"| {word}" not in glossary} == set()
+
+
+def test_tables_of_results_are_those_of_their_files():
+    places = [name for page in results.PAGES for name in results.PLACE.findall(page.read_text())]
+    assert len(places) == len(set(places))
+    assert set(results.TABLES) <= set(places)
+    for page in results.PAGES:
+        assert results.filled(page.read_text()) == page.read_text(), "run: python -m docs.make.results"
+
+
+def test_a_changed_file_of_results_changes_its_table_and_no_other_text(tmp_path, monkeypatch):
+    arctic = json.loads((results.RESULTS / "arctic.json").read_text())
+    arctic["static"]["figures"]["action_followed"] = 0.4321
+    shutil.copytree(results.RESULTS, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "arctic.json").write_text(json.dumps(arctic))
+    before = results.PAGES[1].read_text()
+    monkeypatch.setattr(results, "RESULTS", tmp_path)
+    changed = [line for line in results.filled(before).splitlines() if line not in before.splitlines()]
+    assert len(changed) == 1
+    assert changed[0].startswith("| first frame, repeated | .43 |")
+
+
+def test_a_cell_of_results_has_interval_and_measured_clips_and_the_best_is_bold():
+    def content(value, clips, low=None, high=None):
+        intervals = {"jitter_m_s3": {"clips": [low, high]}} if low is not None else {}
+        counts, unmeasured = {"jitter_m_s3": {"clips": clips}}, {"jitter_m_s3": {"no such frame": 100 - clips}}
+        figures = {"jitter_m_s3": value}
+        return {"figures": figures, "intervals": intervals, "counts": counts, "unmeasured": unmeasured}
+
+    methods = {"near": content(55.2, 94, 51.4, 60.6), "far": content(30.0, 95)}
+    assert results.best_methods(methods, "jitter", content(50.0, 100)) == {"near"}  # closest to the recorded value
+    assert results.cell(methods["near"], "jitter", True, True) == "**55** (51–61) [94]"
+    assert results.cell(methods["far"], "jitter", True, False) == "30"
+    assert [results.number(value, 2) for value in (0.0, 0.004, 0.456, 1.0, 12.3)] == ["0", "0", ".46", "1", "12.30"]
+
+
+def test_an_unknown_name_of_results_is_refused(tmp_path):
+    with pytest.raises(BadInput, match="one of arctic, arctic-hands, embedded-arctic"):
+        results.collect("artic", tmp_path)
