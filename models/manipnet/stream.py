@@ -9,14 +9,14 @@
 """
 
 import operator
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import NamedTuple, TypeGuard
 
 import numpy as np
 
-from hoidata.clips.clip import SIDES, Side
+from hoidata.clips.clip import FPS, SIDES, Side
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
@@ -28,6 +28,7 @@ from models.manipnet.rollout import FrameContext, HandRollout, Predictor, frame_
 MARGIN_S = 0.25  # frames kept before the oldest trajectory sample, whose velocity needs the frame before it
 ROUNDING_S = 1e-6
 BLEND_S = 0.4
+MAX_GAP_S = 0.5  # a wrist lost for longer makes frames of a recording invalid
 MAX_SPEED_M_S = 10.0  # a faster body has jumped; recorded wrists reach 4 m/s
 MAX_LATE_FRAMES, MAX_PAUSE_S = 10, 5.0
 MAX_POSITION_M, ROTATION_TOLERANCE = 1e3, 1e-3  # of a usable pose; the tolerance is that of R R^T - I
@@ -106,6 +107,34 @@ def motion_of(samples: Trajectory) -> Motion:
     return Motion(np.array([sample.time_s for sample in samples]), rotmats, position_m)
 
 
+def control_of_frames(frames: Sequence[TrackedFrame], model: ObjectModel) -> tuple[Control | None, np.ndarray]:
+    """Trajectories at 30 fps of a tracker's frames with one object, interpolated where a body is lost.
+
+    Returns:
+        The trajectories, None if the object is never tracked; and (2, frame) whether each wrist is tracked, or lost for
+        at most ``MAX_GAP_S``.
+    """
+    bodies: list[list[Sample]] = [[], [], []]  # wrists and object
+    for one in frames:
+        for samples, pose in zip(bodies, (*map(one.wrists.get, SIDES), one.objects.get("right")), strict=True):
+            if is_usable(pose):
+                samples.append(Sample(one.time_s, pose, (one.hinge_rad or {}).get("right", 0.0)))
+    if not bodies[2]:
+        return None, np.zeros((2, 0), bool)
+    first_s, body, valid = frames[0].time_s, motion_of(bodies[2]), []
+    time_s = first_s + np.arange(int((frames[-1].time_s - first_s) * FPS + ROUNDING_S) + 1) / FPS
+    wrists: dict[Side, Motion] = {}
+    for side, samples in zip(SIDES, bodies, strict=False):
+        wrists[side] = motion_of(samples) if samples else untracked_wrist(body.time_s, body.position_m)
+        sample_s = np.array([sample.time_s for sample in samples])
+        before_s = np.append(sample_s, -np.inf)[np.searchsorted(sample_s, time_s + ROUNDING_S) - 1]
+        valid.append(
+            np.append(sample_s, np.inf)[np.searchsorted(sample_s, time_s - ROUNDING_S)] - before_s <= MAX_GAP_S
+        )
+    hinge_rad = np.array([sample.hinge_rad for sample in bodies[2]]) if model.is_articulated else None
+    return Control(wrists, body, model, hinge_rad).at(time_s), np.stack(valid)
+
+
 @dataclass
 class _HandStream:
     """One hand of a stream."""
@@ -161,7 +190,7 @@ class Stream:
         }
         self._wrists: dict[Side, list[Trajectory]] = {side: [] for side in SIDES}
         self._objects: dict[Side, list[Trajectory]] = {side: [] for side in hands}
-        self.pose_count, self.first_s, self._last_s = 0, -np.inf, -np.inf
+        self.pose_count, self.first_s, self.last_s = 0, -np.inf, -np.inf  # times of the first and last frame
         self._clock_offset_s, self._late_frames = 0.0, 0
 
     def push(self, frame: TrackedFrame) -> list[dict[Side, np.ndarray]]:
@@ -170,12 +199,12 @@ class Stream:
             return []
         for side in SIDES:
             if is_usable(pose := frame.wrists.get(side)):
-                add_sample(self._wrists[side], Sample(self._last_s, pose, 0.0), self._ahead_s)
+                add_sample(self._wrists[side], Sample(self.last_s, pose, 0.0), self._ahead_s)
         for side in self.hands:
             angle = (frame.hinge_rad or {}).get(side, np.nan) if self.models[side].is_articulated else 0.0
             if is_usable(pose := frame.objects.get(side)) and np.isfinite(angle):
-                add_sample(self._objects[side], Sample(self._last_s, pose, angle), self._ahead_s)
-        return list(self._ready_poses(self._last_s - self._ahead_s))
+                add_sample(self._objects[side], Sample(self.last_s, pose, angle), self._ahead_s)
+        return list(self._ready_poses(self.last_s - self._ahead_s))
 
     def finish(self) -> list[dict[Side, np.ndarray]]:
         """End the stream: return the poses not yet returned, as if wrists and objects rested after the last frame."""
@@ -187,26 +216,24 @@ class Stream:
         self._hands[side].restart()
 
     def _advance_clock(self, time_s: float) -> bool:
-        """Set ``_last_s`` to the time of a frame; False for a frame to drop."""
-        if self._last_s == -np.inf:
-            self.first_s = self._last_s = time_s
+        """Set ``last_s`` to the time of a frame on the stream's clock; False for a frame to drop."""
+        if self.last_s == -np.inf:
+            self.first_s = self.last_s = time_s
             return True
-        elapsed_s = time_s + self._clock_offset_s - self._last_s
+        elapsed_s = time_s + self._clock_offset_s - self.last_s
         if elapsed_s == 0 or (elapsed_s < 0 and self._late_frames < MAX_LATE_FRAMES):
             self._late_frames += elapsed_s < 0
             return False
         if not 0 < elapsed_s <= MAX_PAUSE_S:  # count it as a pause that starts new trajectories
             self._clock_offset_s += self._ahead_s + MARGIN_S - elapsed_s
-        self._last_s, self._late_frames = time_s + self._clock_offset_s, 0
+        self.last_s, self._late_frames = time_s + self._clock_offset_s, 0
         return True
 
     def _ready_poses(self, until_s: float) -> Iterator[dict[Side, np.ndarray]]:
         """Poses whose input, one step earlier, is before ``until_s``."""
-        if self.pose_count == 0 and self._last_s > -np.inf:
+        if self.pose_count == 0 and self.last_s > -np.inf:
             yield self._next_poses()
-        while (
-            self._time_s(self.pose_count - 1) < until_s and self._time_s(self.pose_count) <= self._last_s + ROUNDING_S
-        ):
+        while self._time_s(self.pose_count - 1) < until_s and self._time_s(self.pose_count) <= self.last_s + ROUNDING_S:
             now_s, next_s = self._time_s(self.pose_count - 1), self._time_s(self.pose_count)
             sides: list[Side] = [
                 side for side in self.hands if self._is_tracked(side, now_s) and self._is_tracked(side, next_s)
