@@ -29,7 +29,7 @@ MARGIN_S = 0.25  # frames kept before the oldest trajectory sample, whose veloci
 ROUNDING_S = 1e-6
 BLEND_S = 0.4
 MAX_GAP_S = 0.5  # a wrist lost for longer makes frames of a recording invalid
-MAX_SPEED_M_S = 10.0  # a faster body has jumped; recorded wrists reach 4 m/s
+MAX_SPEED_M_S, MAX_TURN_RAD_S = 10.0, 40.0  # a faster body has jumped; recorded wrists reach 4 m/s
 MAX_LATE_FRAMES, MAX_PAUSE_S = 10, 5.0
 MAX_POSITION_M, ROTATION_TOLERANCE = 1e3, 1e-3  # of a usable pose; the tolerance is that of R R^T - I
 
@@ -80,15 +80,19 @@ def is_usable(pose: RigidTransform | None) -> TypeGuard[RigidTransform]:
     return bool(error < ROTATION_TOLERANCE and np.linalg.det(pose.rotation) > 0)
 
 
+def is_jump(before: Sample, after: Sample) -> bool:
+    """Whether a body moved or turned faster than it can between two frames."""
+    elapsed_s = after.time_s - before.time_s
+    moved_m = np.linalg.norm(after.pose.translation - before.pose.translation)
+    cosine = ((before.pose.rotation * after.pose.rotation).sum() - 1) / 2
+    return bool(moved_m > MAX_SPEED_M_S * elapsed_s or cosine < np.cos(min(MAX_TURN_RAD_S * elapsed_s, np.pi)) - 1e-6)
+
+
 def add_sample(trajectories: list[Trajectory], sample: Sample, max_gap_s: float) -> None:
     """Append to the last trajectory; start a new one after a gap or jump."""
     if trajectories:
         last = trajectories[-1][-1]
-        elapsed_s, moved_m = (
-            sample.time_s - last.time_s,
-            np.linalg.norm(sample.pose.translation - last.pose.translation),
-        )
-        if elapsed_s <= max_gap_s and moved_m <= MAX_SPEED_M_S * elapsed_s:
+        if sample.time_s - last.time_s <= max_gap_s and not is_jump(last, sample):
             trajectories[-1].append(sample)
             return
     trajectories.append([sample])
@@ -97,6 +101,17 @@ def add_sample(trajectories: list[Trajectory], sample: Sample, max_gap_s: float)
 def trajectory_at(trajectories: list[Trajectory], time_s: float) -> Trajectory:
     """The last trajectory that has started at a time; empty if none has."""
     return next((samples for samples in reversed(trajectories) if samples[0].time_s <= time_s), [])
+
+
+def joined_at(trajectories: list[Trajectory], time_s: float) -> Trajectory:
+    """The trajectory at a time, or the first, with those before and after it up to the next jump."""
+    joined: list[Trajectory] = []
+    for samples in trajectories:
+        if joined and not is_jump(joined[-1][-1], samples[0]):
+            joined[-1] = joined[-1] + samples
+        else:
+            joined.append(samples)
+    return trajectory_at(joined, time_s) or next(iter(joined), [])
 
 
 def motion_of(samples: Trajectory) -> Motion:
@@ -142,7 +157,9 @@ class _HandStream:
     rollout: HandRollout
     blend_start: np.ndarray  # (joint - 1, 3, 3) the pose from which to blend
     blend_step: float  # increase of ``blended`` in a step
+    model: ObjectModel  # its object at the time of its pose
     blended: float = 1.0  # weight of the predicted pose
+    exchange_s: float = np.inf  # from when on the object is another
     trajectories: tuple[Trajectory, Trajectory] | None = None  # of wrist and object in the last step
 
     @property
@@ -184,7 +201,10 @@ class Stream:
         surfaces = {side: surface_index(models[side]).prepare() for side in hands}
         self._hands: dict[Side, _HandStream] = {
             side: _HandStream(
-                HandRollout(predictor, hands[side], surfaces[side], start[side]), start[side], settings.step_s / BLEND_S
+                HandRollout(predictor, hands[side], surfaces[side], start[side]),
+                start[side],
+                settings.step_s / BLEND_S,
+                models[side],
             )
             for side in hands
         }
@@ -203,7 +223,9 @@ class Stream:
         for side in self.hands:
             angle = (frame.hinge_rad or {}).get(side, np.nan) if self.models[side].is_articulated else 0.0
             if is_usable(pose := frame.objects.get(side)) and np.isfinite(angle):
-                add_sample(self._objects[side], Sample(self.last_s, pose, angle), self._ahead_s)
+                objects, exchange_s = self._objects[side], self._hands[side].exchange_s
+                is_other = bool(objects) and objects[-1][-1].time_s <= exchange_s < np.inf
+                add_sample(objects, Sample(self.last_s, pose, angle), -1.0 if is_other else self._ahead_s)
         return list(self._ready_poses(self.last_s - self._ahead_s))
 
     def finish(self) -> list[dict[Side, np.ndarray]]:
@@ -211,9 +233,9 @@ class Stream:
         return list(self._ready_poses(np.inf))
 
     def exchange(self, side: Side, model: ObjectModel) -> None:
-        """Replace the object of a hand while the stream runs; its tracked pose now moves the new mesh."""
-        self.models[side], self._hands[side].rollout.surface = model, surface_index(model).prepare()
-        self._hands[side].restart()
+        """Replace the object of a hand after the last frame; its tracked pose then moves the new mesh."""
+        surface_index(model).prepare()
+        self.models[side], self._hands[side].exchange_s = model, self.last_s
 
     def _advance_clock(self, time_s: float) -> bool:
         """Set ``last_s`` to the time of a frame on the stream's clock; False for a frame to drop."""
@@ -235,6 +257,11 @@ class Stream:
             yield self._next_poses()
         while self._time_s(self.pose_count - 1) < until_s and self._time_s(self.pose_count) <= self.last_s + ROUNDING_S:
             now_s, next_s = self._time_s(self.pose_count - 1), self._time_s(self.pose_count)
+            for side, hand in self._hands.items():
+                if next_s > hand.exchange_s:
+                    hand.model, hand.exchange_s = self.models[side], np.inf
+                    hand.rollout.surface = surface_index(hand.model)
+                    hand.restart()
             sides: list[Side] = [
                 side for side in self.hands if self._is_tracked(side, now_s) and self._is_tracked(side, next_s)
             ]
@@ -282,14 +309,15 @@ class Stream:
         stop_s = min(body[-1].time_s for body in bodies) + ROUNDING_S
         wrist, samples = ([sample for sample in body if sample.time_s <= stop_s] for body in bodies)
         body = motion_of(samples)
-        # The other wrist is interpolated over any gap: its distance then has no jump.
+        # The other wrist is interpolated over gaps and rests at jumps: its distance then has no jump.
         wrists: dict[Side, Motion] = {
             other: motion_of(frames) if frames else untracked_wrist(body.time_s, body.position_m)
             for other in SIDES
-            for frames in [wrist if other == side else list(chain(*self._wrists[other]))]
+            for frames in [wrist if other == side else joined_at(self._wrists[other], time_s)]
         }
-        hinge_rad = np.array([sample.hinge_rad for sample in samples]) if self.models[side].is_articulated else None
-        return Control(wrists, body, self.models[side], hinge_rad)
+        model = self._hands[side].model
+        hinge_rad = np.array([sample.hinge_rad for sample in samples]) if model.is_articulated else None
+        return Control(wrists, body, model, hinge_rad)
 
 
 def _discard(trajectories: list[Trajectory], before_s: float) -> None:
