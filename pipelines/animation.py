@@ -359,10 +359,10 @@ def _played(
 
 def _at_recorded_speed(frames: Iterable[TrackedFrame]) -> Iterator[TrackedFrame]:
     """Yield each frame at its time after the first."""
-    first_s, started_s = None, time.monotonic()
+    offset_s = None
     for frame in frames:
-        first_s = frame.time_s if first_s is None else first_s
-        time.sleep(max(frame.time_s - first_s - (time.monotonic() - started_s), 0))
+        offset_s = time.monotonic() - frame.time_s if offset_s is None else offset_s
+        time.sleep(max(frame.time_s + offset_s - time.monotonic(), 0))
         yield frame
 
 

@@ -2,8 +2,7 @@
 
 A frame: ``{"time_s": 1.25, "object": [x, y, z, qw, qx, qy, qz], "left": null, "right": [...], "hinge_rad": 0.3}``, with
 metres, seconds of any clock, and ``hinge_rad`` for a hinged object. A missing body, null or NaN: the tracker lost it.
-``{"end": true}`` ends the stream. A pose: ``{"time_s": 0.5, "left": [[x, y, z], ...], "right": ...}``, axis-angles of
-the finger joints.
+``{"end": true}`` ends the stream. A pose: ``{"time_s": 0.5, "left": [[x, y, z], ...], "right": ...}``, axis-angles.
 """
 
 import json

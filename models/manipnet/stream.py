@@ -123,11 +123,9 @@ def motion_of(samples: Trajectory) -> Motion:
 
 
 def control_of_frames(frames: Sequence[TrackedFrame], model: ObjectModel) -> tuple[Control | None, np.ndarray]:
-    """Trajectories at 30 fps of a tracker's frames with one object, interpolated where a body is lost.
+    """Trajectories at 30 fps of a tracker's frames with one object, interpolated where a body is lost; None without it.
 
-    Returns:
-        The trajectories, None if the object is never tracked; and (2, frame) whether each wrist is tracked, or lost for
-        at most ``MAX_GAP_S``.
+    Also (2, frame) whether each wrist is tracked, or lost for at most ``MAX_GAP_S``.
     """
     bodies: list[list[Sample]] = [[], [], []]  # wrists and object
     for one in frames:
@@ -156,7 +154,6 @@ class _HandStream:
 
     rollout: HandRollout
     blend_start: np.ndarray  # (joint - 1, 3, 3) the pose from which to blend
-    blend_step: float  # increase of ``blended`` in a step
     model: ObjectModel  # its object at the time of its pose
     blended: float = 1.0  # weight of the predicted pose
     exchange_s: float = np.inf  # from when on the object is another
@@ -201,10 +198,7 @@ class Stream:
         surfaces = {side: surface_index(models[side]).prepare() for side in hands}
         self._hands: dict[Side, _HandStream] = {
             side: _HandStream(
-                HandRollout(predictor, hands[side], surfaces[side], start[side]),
-                start[side],
-                settings.step_s / BLEND_S,
-                models[side],
+                HandRollout(predictor, hands[side], surfaces[side], start[side]), start[side], models[side]
             )
             for side in hands
         }
@@ -273,7 +267,7 @@ class Stream:
                 transforms, hinge = object_from_wrist(control, side, np.array([next_s]), settings)
                 following = FrameContext(np.empty(0), transforms[0], None if hinge is None else hinge[0])
                 self._hands[side].rollout.advance(output, following)
-                self._hands[side].blended += self._hands[side].blend_step
+                self._hands[side].blended += settings.step_s / BLEND_S
             yield self._next_poses()
             for bodies in chain(self._wrists.values(), self._objects.values()):
                 _discard(bodies, now_s - self._behind_s - MARGIN_S)
