@@ -8,7 +8,7 @@ Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder with the e
 
 import sys
 
-from bench import adapters, bimart, bimart_tables, kernels, paper_tables, recordings, samplers, scale
+from bench import adapters, bimart, bimart_tables, kernels, paper_tables, recordings, samplers, scale, soak
 
 BENCHMARKS = {
     "adapters": adapters.main,
@@ -18,8 +18,9 @@ BENCHMARKS = {
     "samplers": samplers.main,
     "bimart-tables": bimart_tables.main,
     "recordings": recordings.main,
+    "soak": soak.main,
 }
-ON_REQUEST = ("bimart-tables", "recordings")  # they need data, and train for hours
+ON_REQUEST = ("bimart-tables", "recordings", "soak")  # they need data or a network, and run for hours
 
 
 def main() -> int:

@@ -1,7 +1,9 @@
 """`hoidata animate` and `stream`: finger motion for trajectories, or for frames of a stored clip (ManipNet)."""
 
+import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from os.path import isfile  # returns False for a name that is too long, where Path.is_file raises
@@ -33,11 +35,12 @@ from models.manipnet.animate import (
     with_fingers,
 )
 from models.manipnet.control import Control, control_from_clip, hands_of
+from models.manipnet.datagrams import Tracker, parse_address, pose_line
 from models.manipnet.network import ManipNet
 from models.manipnet.rollout import Predictor, Rule
-from models.manipnet.stream import Stream, tracked_frames
+from models.manipnet.stream import Stream, TrackedFrame, control_of_frames, tracked_frames
 from models.manipnet.training import MANIPNET
-from models.manipnet.trajectory_files import ENDINGS, Axes, TrajectoryFile, read_trajectories
+from models.manipnet.trajectory_files import ENDINGS, MAX_FRAMES, Axes, TrajectoryFile, read_trajectories
 from pipelines.command_inputs import (
     MeshOptions,
     ProjectData,
@@ -83,6 +86,7 @@ class AnimationOptions:
             "--world-up": self.up,
             "--unit": self.mesh.unit,
             "--hinge": self.mesh.hinge,
+            "--moving": self.mesh.moving,
         }
         for option, value in file_options.items():
             if value:
@@ -157,20 +161,39 @@ def stream_files(
     datasets: tuple[str, ...],
     out: Path,
     store: Path | None,
-    show: ShowPoses,
+    show: Callable[[str], None],
+    report: Callable[[str], None],
+    to: str = "",
     in_real_time: bool = True,
 ) -> WrittenFiles:
-    """Play a file of trajectories through a live ``Stream``, and write its poses as ``animate_files`` does.
+    """Run a live ``Stream`` for a file of trajectories or a tracker, and write its poses as ``animate_files`` does.
 
     Args:
-        show: called with each predicted pose, without delay.
-        in_real_time: push each frame at its recorded time; else without waiting.
+        source: the file, or the address at which a tracker's frames arrive (``models.manipnet.datagrams``).
+        show: called with each predicted pose as a line of JSON, without delay.
+        report: called with the reason why a datagram was refused.
+        to: the address to which poses are sent too, or "".
+        in_real_time: push each frame of a file at its recorded time; else without waiting.
     """
     check_new_store(store)
     make_repeatable(threads=1)
     project = ProjectData(profile, datasets, load_hands(profile))
-    predict = partial(_stream_fingers, show=show, in_real_time=in_real_time)
-    return _written(_from_file(Path(source), options, project, predict), out, store)
+    address = parse_address(to) if to else None
+    with socket.socket(type=socket.SOCK_DGRAM) as sender:
+
+        def show_pose(time_s: float, poses: Mapping[Side, np.ndarray]) -> None:
+            line = pose_line(time_s, poses)
+            show(line)
+            if address:
+                with suppress(OSError):  # a datagram may be lost
+                    sender.sendto(line.encode(), address)
+
+        if "://" in source:
+            animation = _from_tracker(source, options, project, show_pose, report)
+        else:
+            predict = partial(_stream_fingers, show=show_pose, in_real_time=in_real_time)
+            animation = _from_file(Path(source), options, project, predict)
+    return _written(animation, out, store)
 
 
 def _written(animation: Animation, out: Path, store: Path | None) -> WrittenFiles:
@@ -301,21 +324,80 @@ def _stream_fingers(
     show: ShowPoses,
     in_real_time: bool,
 ) -> dict[Side, np.ndarray]:
-    models: dict[Side, ObjectModel] = dict.fromkeys(hands, control.model)
+    frames = tracked_frames(tracked)
+    _, poses = _played(predictor, hands, control.model, _at_recorded_speed(frames) if in_real_time else frames, show)
+    return _poses_of_frames(poses, predictor, hands, len(control.object_motion.time_s))
+
+
+def _played(
+    predictor: Predictor,
+    hands: Mapping[Side, TrackedHand],
+    model: ObjectModel,
+    frames: Iterable[TrackedFrame],
+    show: ShowPoses,
+) -> tuple[list[TrackedFrame], list[dict[Side, np.ndarray]]]:
+    """Push frames through a stream; return those that are not late, with times of its clock, and all poses."""
     start: dict[Side, np.ndarray] = {side: hand.rest_rotmats for side, hand in hands.items()}
-    stream, shown = Stream(predictor, hands, models, start), list[Mapping[Side, np.ndarray]]()
-    step_s, first_s, started_s = predictor.settings.step_s, tracked.object_motion.time_s[0], time.monotonic()
-    for frame in tracked_frames(tracked):
-        if in_real_time:
-            time.sleep(max(frame.time_s - first_s - (time.monotonic() - started_s), 0))
-        for poses in stream.push(frame):
-            show(len(shown) * step_s, poses)
-            shown.append(poses)
-    for poses in stream.finish():
-        show(len(shown) * step_s, poses)
-        shown.append(poses)
-    numbers = np.round(np.arange(len(control.object_motion.time_s)) / FPS / step_s).astype(int).clip(0, len(shown) - 1)
-    return {side: np.stack([shown[number][side] for number in numbers]) for side in hands}
+    stream, accepted = Stream(predictor, hands, dict.fromkeys(hands, model), start), list[TrackedFrame]()
+    shown: list[dict[Side, np.ndarray]] = []
+
+    def show_all(poses: list[dict[Side, np.ndarray]]) -> None:
+        for pose in poses:
+            show(len(shown) * predictor.settings.step_s, pose)
+            shown.append(pose)
+
+    for frame in frames:
+        before_s = stream.last_s
+        show_all(stream.push(frame))
+        if stream.last_s > before_s:
+            accepted.append(replace(frame, time_s=stream.last_s))
+        if len(accepted) == MAX_FRAMES:
+            break
+    show_all(stream.finish())
+    return accepted, shown
+
+
+def _at_recorded_speed(frames: Iterable[TrackedFrame]) -> Iterator[TrackedFrame]:
+    """Yield each frame at its time after the first."""
+    offset_s = None
+    for frame in frames:
+        offset_s = time.monotonic() - frame.time_s if offset_s is None else offset_s
+        time.sleep(max(frame.time_s + offset_s - time.monotonic(), 0))
+        yield frame
+
+
+def _poses_of_frames(
+    poses: list[dict[Side, np.ndarray]], predictor: Predictor, hands: Mapping[Side, TrackedHand], n_frames: int
+) -> dict[Side, np.ndarray]:
+    """The poses (frame, 15, 3, 3) of each hand at 30 fps."""
+    numbers = np.round(np.arange(n_frames) / FPS / predictor.settings.step_s).astype(int).clip(0, len(poses) - 1)
+    return {side: np.stack([poses[number][side] for number in numbers]) for side in hands}
+
+
+def _from_tracker(
+    source: str, options: AnimationOptions, project: ProjectData, show: ShowPoses, report: Callable[[str], None]
+) -> Animation:
+    """Animate a tracker's frames until they end; a hand is invalid while its wrist is lost."""
+    address = parse_address(source)
+    network = chosen_network(options, project)
+    model, notes = _object(options, options.mesh.unit, project)
+    mean_hands, predictor = hands_of(project.hands, np.zeros((2, 10), np.float32), None), network.predictor
+    hands: dict[Side, TrackedHand] = {side: mean_hands[side] for side in options.sides}
+    tracker = Tracker(address, model.is_articulated, report)
+    frames, poses = _played(predictor, hands, model, tracker.frames(), show)
+    notes.append(f"{tracker.refused} of {tracker.received} datagrams were refused")
+    control, valid = control_of_frames(frames, model)
+    if control is None or not valid[[side in hands for side in SIDES]].any():
+        got = f"none in {len(frames)} frames"
+        raise BadInput(source, "poses of the object and of a wrist", got, "send them (docs/fingers.md)")
+    fingers = _poses_of_frames(poses, predictor, hands, valid.shape[1])
+    clip = clip_of(control, fingers, UPS[options.up], "live", network.is_synthetic)
+    generated = valid & np.array([[side in hands] for side in SIDES])
+    tracks: dict[Side, HandTrack] = {
+        side: replace(clip.hands[side], valid=tracked) for side, tracked in zip(SIDES, generated, strict=True)
+    }
+    rows = [*network.rows, ("object", model.name), ("source", source)]
+    return Animation(replace(clip, hands=tracks), generated, {}, project.hands, rows, notes, network.facts)
 
 
 def _from_file(

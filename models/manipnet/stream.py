@@ -9,14 +9,14 @@
 """
 
 import operator
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import NamedTuple, TypeGuard
 
 import numpy as np
 
-from hoidata.clips.clip import SIDES, Side
+from hoidata.clips.clip import FPS, SIDES, Side
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
@@ -28,7 +28,8 @@ from models.manipnet.rollout import FrameContext, HandRollout, Predictor, frame_
 MARGIN_S = 0.25  # frames kept before the oldest trajectory sample, whose velocity needs the frame before it
 ROUNDING_S = 1e-6
 BLEND_S = 0.4
-MAX_SPEED_M_S = 10.0  # a faster body has jumped; recorded wrists reach 4 m/s
+MAX_GAP_S = 0.5  # a wrist lost for longer makes frames of a recording invalid
+MAX_SPEED_M_S, MAX_TURN_RAD_S = 10.0, 40.0  # a faster body has jumped; recorded wrists reach 4 m/s
 MAX_LATE_FRAMES, MAX_PAUSE_S = 10, 5.0
 MAX_POSITION_M, ROTATION_TOLERANCE = 1e3, 1e-3  # of a usable pose; the tolerance is that of R R^T - I
 
@@ -79,15 +80,19 @@ def is_usable(pose: RigidTransform | None) -> TypeGuard[RigidTransform]:
     return bool(error < ROTATION_TOLERANCE and np.linalg.det(pose.rotation) > 0)
 
 
+def is_jump(before: Sample, after: Sample) -> bool:
+    """Whether a body moved or turned faster than it can between two frames."""
+    elapsed_s = after.time_s - before.time_s
+    moved_m = np.linalg.norm(after.pose.translation - before.pose.translation)
+    cosine = ((before.pose.rotation * after.pose.rotation).sum() - 1) / 2
+    return bool(moved_m > MAX_SPEED_M_S * elapsed_s or cosine < np.cos(min(MAX_TURN_RAD_S * elapsed_s, np.pi)) - 1e-6)
+
+
 def add_sample(trajectories: list[Trajectory], sample: Sample, max_gap_s: float) -> None:
     """Append to the last trajectory; start a new one after a gap or jump."""
     if trajectories:
         last = trajectories[-1][-1]
-        elapsed_s, moved_m = (
-            sample.time_s - last.time_s,
-            np.linalg.norm(sample.pose.translation - last.pose.translation),
-        )
-        if elapsed_s <= max_gap_s and moved_m <= MAX_SPEED_M_S * elapsed_s:
+        if sample.time_s - last.time_s <= max_gap_s and not is_jump(last, sample):
             trajectories[-1].append(sample)
             return
     trajectories.append([sample])
@@ -98,6 +103,17 @@ def trajectory_at(trajectories: list[Trajectory], time_s: float) -> Trajectory:
     return next((samples for samples in reversed(trajectories) if samples[0].time_s <= time_s), [])
 
 
+def joined_at(trajectories: list[Trajectory], time_s: float) -> Trajectory:
+    """The trajectory at a time, or the first, with those before and after it up to the next jump."""
+    joined: list[Trajectory] = []
+    for samples in trajectories:
+        if joined and not is_jump(joined[-1][-1], samples[0]):
+            joined[-1] = joined[-1] + samples
+        else:
+            joined.append(samples)
+    return trajectory_at(joined, time_s) or next(iter(joined), [])
+
+
 def motion_of(samples: Trajectory) -> Motion:
     """A trajectory with interpolation."""
     rotmats, position_m = (
@@ -106,14 +122,41 @@ def motion_of(samples: Trajectory) -> Motion:
     return Motion(np.array([sample.time_s for sample in samples]), rotmats, position_m)
 
 
+def control_of_frames(frames: Sequence[TrackedFrame], model: ObjectModel) -> tuple[Control | None, np.ndarray]:
+    """Trajectories at 30 fps of a tracker's frames with one object, interpolated where a body is lost; None without it.
+
+    Also (2, frame) whether each wrist is tracked, or lost for at most ``MAX_GAP_S``.
+    """
+    bodies: list[list[Sample]] = [[], [], []]  # wrists and object
+    for one in frames:
+        for samples, pose in zip(bodies, (*map(one.wrists.get, SIDES), one.objects.get("right")), strict=True):
+            if is_usable(pose):
+                samples.append(Sample(one.time_s, pose, (one.hinge_rad or {}).get("right", 0.0)))
+    if not bodies[2]:
+        return None, np.zeros((2, 0), bool)
+    first_s, body, valid = frames[0].time_s, motion_of(bodies[2]), []
+    time_s = first_s + np.arange(int((frames[-1].time_s - first_s) * FPS + ROUNDING_S) + 1) / FPS
+    wrists: dict[Side, Motion] = {}
+    for side, samples in zip(SIDES, bodies, strict=False):
+        wrists[side] = motion_of(samples) if samples else untracked_wrist(body.time_s, body.position_m)
+        sample_s = np.array([sample.time_s for sample in samples])
+        before_s = np.append(sample_s, -np.inf)[np.searchsorted(sample_s, time_s + ROUNDING_S) - 1]
+        valid.append(
+            np.append(sample_s, np.inf)[np.searchsorted(sample_s, time_s - ROUNDING_S)] - before_s <= MAX_GAP_S
+        )
+    hinge_rad = np.array([sample.hinge_rad for sample in bodies[2]]) if model.is_articulated else None
+    return Control(wrists, body, model, hinge_rad).at(time_s), np.stack(valid)
+
+
 @dataclass
 class _HandStream:
     """One hand of a stream."""
 
     rollout: HandRollout
     blend_start: np.ndarray  # (joint - 1, 3, 3) the pose from which to blend
-    blend_step: float  # increase of ``blended`` in a step
+    model: ObjectModel  # its object at the time of its pose
     blended: float = 1.0  # weight of the predicted pose
+    exchange_s: float = np.inf  # from when on the object is another
     trajectories: tuple[Trajectory, Trajectory] | None = None  # of wrist and object in the last step
 
     @property
@@ -155,13 +198,13 @@ class Stream:
         surfaces = {side: surface_index(models[side]).prepare() for side in hands}
         self._hands: dict[Side, _HandStream] = {
             side: _HandStream(
-                HandRollout(predictor, hands[side], surfaces[side], start[side]), start[side], settings.step_s / BLEND_S
+                HandRollout(predictor, hands[side], surfaces[side], start[side]), start[side], models[side]
             )
             for side in hands
         }
         self._wrists: dict[Side, list[Trajectory]] = {side: [] for side in SIDES}
         self._objects: dict[Side, list[Trajectory]] = {side: [] for side in hands}
-        self.pose_count, self.first_s, self._last_s = 0, -np.inf, -np.inf
+        self.pose_count, self.first_s, self.last_s = 0, -np.inf, -np.inf  # times of the first and last frame
         self._clock_offset_s, self._late_frames = 0.0, 0
 
     def push(self, frame: TrackedFrame) -> list[dict[Side, np.ndarray]]:
@@ -170,44 +213,49 @@ class Stream:
             return []
         for side in SIDES:
             if is_usable(pose := frame.wrists.get(side)):
-                add_sample(self._wrists[side], Sample(self._last_s, pose, 0.0), self._ahead_s)
+                add_sample(self._wrists[side], Sample(self.last_s, pose, 0.0), self._ahead_s)
         for side in self.hands:
             angle = (frame.hinge_rad or {}).get(side, np.nan) if self.models[side].is_articulated else 0.0
             if is_usable(pose := frame.objects.get(side)) and np.isfinite(angle):
-                add_sample(self._objects[side], Sample(self._last_s, pose, angle), self._ahead_s)
-        return list(self._ready_poses(self._last_s - self._ahead_s))
+                objects, exchange_s = self._objects[side], self._hands[side].exchange_s
+                is_other = bool(objects) and objects[-1][-1].time_s <= exchange_s < np.inf
+                add_sample(objects, Sample(self.last_s, pose, angle), -1.0 if is_other else self._ahead_s)
+        return list(self._ready_poses(self.last_s - self._ahead_s))
 
     def finish(self) -> list[dict[Side, np.ndarray]]:
         """End the stream: return the poses not yet returned, as if wrists and objects rested after the last frame."""
         return list(self._ready_poses(np.inf))
 
     def exchange(self, side: Side, model: ObjectModel) -> None:
-        """Replace the object of a hand while the stream runs; its tracked pose now moves the new mesh."""
-        self.models[side], self._hands[side].rollout.surface = model, surface_index(model).prepare()
-        self._hands[side].restart()
+        """Replace the object of a hand after the last frame; its tracked pose then moves the new mesh."""
+        surface_index(model).prepare()
+        self.models[side], self._hands[side].exchange_s = model, self.last_s
 
     def _advance_clock(self, time_s: float) -> bool:
-        """Set ``_last_s`` to the time of a frame; False for a frame to drop."""
-        if self._last_s == -np.inf:
-            self.first_s = self._last_s = time_s
+        """Set ``last_s`` to the time of a frame on the stream's clock; False for a frame to drop."""
+        if self.last_s == -np.inf:
+            self.first_s = self.last_s = time_s
             return True
-        elapsed_s = time_s + self._clock_offset_s - self._last_s
+        elapsed_s = time_s + self._clock_offset_s - self.last_s
         if elapsed_s == 0 or (elapsed_s < 0 and self._late_frames < MAX_LATE_FRAMES):
             self._late_frames += elapsed_s < 0
             return False
         if not 0 < elapsed_s <= MAX_PAUSE_S:  # count it as a pause that starts new trajectories
             self._clock_offset_s += self._ahead_s + MARGIN_S - elapsed_s
-        self._last_s, self._late_frames = time_s + self._clock_offset_s, 0
+        self.last_s, self._late_frames = time_s + self._clock_offset_s, 0
         return True
 
     def _ready_poses(self, until_s: float) -> Iterator[dict[Side, np.ndarray]]:
         """Poses whose input, one step earlier, is before ``until_s``."""
-        if self.pose_count == 0 and self._last_s > -np.inf:
+        if self.pose_count == 0 and self.last_s > -np.inf:
             yield self._next_poses()
-        while (
-            self._time_s(self.pose_count - 1) < until_s and self._time_s(self.pose_count) <= self._last_s + ROUNDING_S
-        ):
+        while self._time_s(self.pose_count - 1) < until_s and self._time_s(self.pose_count) <= self.last_s + ROUNDING_S:
             now_s, next_s = self._time_s(self.pose_count - 1), self._time_s(self.pose_count)
+            for side, hand in self._hands.items():
+                if next_s > hand.exchange_s:
+                    hand.model, hand.exchange_s = self.models[side], np.inf
+                    hand.rollout.surface = surface_index(hand.model)
+                    hand.restart()
             sides: list[Side] = [
                 side for side in self.hands if self._is_tracked(side, now_s) and self._is_tracked(side, next_s)
             ]
@@ -219,7 +267,7 @@ class Stream:
                 transforms, hinge = object_from_wrist(control, side, np.array([next_s]), settings)
                 following = FrameContext(np.empty(0), transforms[0], None if hinge is None else hinge[0])
                 self._hands[side].rollout.advance(output, following)
-                self._hands[side].blended += self._hands[side].blend_step
+                self._hands[side].blended += settings.step_s / BLEND_S
             yield self._next_poses()
             for bodies in chain(self._wrists.values(), self._objects.values()):
                 _discard(bodies, now_s - self._behind_s - MARGIN_S)
@@ -255,14 +303,15 @@ class Stream:
         stop_s = min(body[-1].time_s for body in bodies) + ROUNDING_S
         wrist, samples = ([sample for sample in body if sample.time_s <= stop_s] for body in bodies)
         body = motion_of(samples)
-        # The other wrist is interpolated over any gap: its distance then has no jump.
+        # The other wrist is interpolated over gaps and rests at jumps: its distance then has no jump.
         wrists: dict[Side, Motion] = {
             other: motion_of(frames) if frames else untracked_wrist(body.time_s, body.position_m)
             for other in SIDES
-            for frames in [wrist if other == side else list(chain(*self._wrists[other]))]
+            for frames in [wrist if other == side else joined_at(self._wrists[other], time_s)]
         }
-        hinge_rad = np.array([sample.hinge_rad for sample in samples]) if self.models[side].is_articulated else None
-        return Control(wrists, body, self.models[side], hinge_rad)
+        model = self._hands[side].model
+        hinge_rad = np.array([sample.hinge_rad for sample in samples]) if model.is_articulated else None
+        return Control(wrists, body, model, hinge_rad)
 
 
 def _discard(trajectories: list[Trajectory], before_s: float) -> None:

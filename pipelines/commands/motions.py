@@ -11,9 +11,6 @@ from pipelines.commands.project import current_profile, enter_project, hands_of
 from pipelines.params import read_params
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from hoidata.clips.clip import Side
     from pipelines.command_inputs import WrittenFiles
     from pipelines.generation import Models
 
@@ -34,29 +31,27 @@ Up = Annotated[
 ]
 MeshHinge = Annotated[
     str,
-    typer.Option(
-        help="Hinge of a mesh of two pieces, 'px,py,pz dx,dy,dz': a point on the axis (file's unit) and its direction; "
-        "a slide has only a direction."
-    ),
+    typer.Option(help="Hinge of a mesh of two pieces, 'px,py,pz dx,dy,dz': point and direction; a slide: direction."),
 ]
 Moving = Annotated[
     str,
-    typer.Option(help="What moves: a joint of a URDF, or with --hinge pieces of a mesh (docs/generate.md)."),
+    typer.Option(help="What moves: joint of a URDF, or pieces of a mesh with --hinge."),
 ]
 Profile = Annotated[str, typer.Option(help="Profile: embedded, study or own. Default: the one in params.yaml.")]
 
 TracedObject = Annotated[
     str,
     typer.Option(
-        "--object", help="The object of the trajectories: a mesh file (OBJ, PLY, STL, GLB) or a dataset's object."
+        "--object", help="The object: a mesh file (OBJ, PLY, STL, GLB), a URDF or its folder, or a dataset's."
     ),
 ]
 Fingers = Annotated[Literal["left", "right", "both"], typer.Option(help="Hands to animate.")]
+MeshUnit = Annotated[
+    str, typer.Option(help="Unit of a mesh file: m, cm, mm, dm or inch. Default: m, dm with ManipNet's .txt.")
+]
 WorldUp = Annotated[
     str,
-    typer.Option(
-        help="World axis that points up, x, y or z; affects the display and the store. Default: from the file."
-    ),
+    typer.Option(help="World axis that points up, x, y or z, for display and store. Default: from the file."),
 ]
 
 
@@ -80,8 +75,7 @@ PredictedLength = Annotated[
 ModelFolder = Annotated[
     Path | None,
     typer.Option(
-        help="Folder with the checkpoints of one dataset, such as checkpoints/embedded/grab; works outside of a "
-        "project. Default: the project's checkpoints.",
+        help="Folder with the checkpoints of one dataset; works outside of a project. Default: the project's.",
         exists=True,
         file_okay=False,
     ),
@@ -101,7 +95,7 @@ Steps = Annotated[
 Refine = Annotated[
     Literal["network", "contact", "none"] | None,
     typer.Option(
-        help="What corrects the hands: the refiner network, contact refinement by optimisation, or nothing. "
+        help="What corrects the hands: the refiner network, contact optimisation, or nothing. "
         "Default: params.yaml; without it network."
     ),
 ]
@@ -112,17 +106,16 @@ Attempts = Annotated[
 HandBy = Annotated[
     Literal["rules", "similarity"] | None,
     typer.Option(
-        help="How to choose the hands without --hand. rules: grammar rules; for a phrase they do not cover, the "
-        "similarity of text features; for a sentence without a hand, the most frequent one in training. "
-        "similarity: Text2HOI's method, the most similar of three phrases. Default: rules; similarity for preset "
-        "paper."
+        help="How to choose the hands without --hand. rules: grammar rules; for other phrases the similarity of "
+        "text features; for a sentence without a hand the most frequent one in training. similarity: Text2HOI's "
+        "method, the most similar of three phrases. Default: rules; similarity for preset paper."
     ),
 ]
 Encoder = Annotated[
     str,
     typer.Option(
-        help="Text encoder for --models that were trained with CLIP: clip:FILE.safetensors or clip:openai. "
-        "Default: the encoder that the checkpoints name."
+        help="Text encoder for --models trained with CLIP: clip:FILE.safetensors or clip:openai. "
+        "Default: the checkpoints' encoder."
     ),
 ]
 
@@ -218,8 +211,7 @@ def animate(
         str,
         typer.Argument(
             metavar="TRAJECTORIES|CLIP",
-            help="Trajectories of wrists and object in a .csv, .npz or ManipNet .txt file (docs/fingers.md), or the id "
-            "of a stored clip.",
+            help="Trajectories in a .csv, .npz or ManipNet .txt file (docs/fingers.md), or the id of a stored clip.",
         ),
     ],
     out: Out,
@@ -243,21 +235,17 @@ def animate(
     wrist_axes: Annotated[
         Literal["model", "canonical"],
         typer.Option(
-            help="Wrist axes in .csv and .npz files: those of the hand model, or canonical (x to the fingers, y to the "
-            "thumb)."
+            help="Wrist axes in .csv and .npz files: the hand model's, or canonical (x to the fingers, y to the thumb)."
         ),
     ] = "model",
     world_up: WorldUp = "",
-    unit: Annotated[
-        str,
-        typer.Option(help="Unit of a mesh file: m, cm, mm, dm or inch. Default: m, or dm with a ManipNet .txt file."),
-    ] = "",
+    unit: MeshUnit = "",
     hinge: MeshHinge = "",
+    moving: Moving = "",
     way: Annotated[
         Literal["auto", "network", "interpolate"],
         typer.Option(
-            help="How to fill frames of a clip. auto: interpolate gaps of up to 2 s between known poses, else use the "
-            "network."
+            help="How to fill frames of a clip. auto: interpolate gaps up to 2 s between known poses, else network."
         ),
     ] = "auto",
     profile: Profile = "",
@@ -278,7 +266,7 @@ def animate(
         unit=trajectory_unit,
         axes=wrist_axes,
         up=world_up,
-        mesh=MeshOptions(unit, "", hinge),
+        mesh=MeshOptions(unit, "", hinge, moving),
         method=way,
     )
     _print_written(animate_files(source, options, *project, out, store))
@@ -286,32 +274,33 @@ def animate(
 
 def stream(
     source: Annotated[
-        str, typer.Argument(metavar="TRAJECTORIES", help="Trajectories of wrists and object (docs/fingers.md).")
+        str,
+        typer.Option(
+            "--from",
+            help="A file of trajectories, or udp://127.0.0.1:PORT for a tracker (docs/fingers.md).",
+        ),
     ],
     object: TracedObject,
     out: Out,
     store: Store = None,
-    fast: Annotated[bool, typer.Option("--fast", help="Do not wait for the times of the frames.")] = False,
+    to: Annotated[str, typer.Option(help="Also send poses to udp://127.0.0.1:PORT.")] = "",
+    fast: Annotated[bool, typer.Option("--fast", help="Do not wait for the times of a file.")] = False,
     fingers: Fingers = "both",
     model: Annotated[str, typer.Option(help="Dataset whose network to use. Default: the first with a network.")] = "",
     world_up: WorldUp = "",
+    unit: MeshUnit = "",
+    hinge: MeshHinge = "",
+    moving: Moving = "",
 ) -> None:
-    """Play trajectories through the live finger stream at recorded speed.
+    """Stream fingers live for a file, at its recorded speed, or for a tracker.
 
-    Prints a pose per line: time_s, and axis-angles (15, 3) of each hand. Then writes what `animate` does.
+    Prints a pose per line: time_s, axis-angles (15, 3) of each hand. Then writes what `animate` does.
     """
-    import json
-
-    from hoidata.geometry.rotations import rotmat_to_rotvec
-
-    def show(time_s: float, poses: "Mapping[Side, np.ndarray]") -> None:
-        rotations = {side: rotmat_to_rotvec(pose).round(6).tolist() for side, pose in poses.items()}
-        typer.echo(json.dumps({"time_s": round(time_s, 6), **rotations}))
-
     start_folder, project = Path.cwd(), enter_project()
     from hoidata.clips.clip import SIDES
     from hoidata.objects.user_mesh import is_object_path
     from pipelines.animation import AnimationOptions, stream_files
+    from pipelines.command_inputs import MeshOptions
     from pipelines.params import read_params
 
     options = AnimationOptions(
@@ -319,9 +308,19 @@ def stream(
         model=model,
         object=str(start_folder / object) if is_object_path(str(start_folder / object)) else object,
         up=world_up,
+        mesh=MeshOptions(unit, "", hinge, moving),
     )
-    datasets, source = tuple(read_params(project)["datasets"]), str(start_folder / source)
-    written = stream_files(source, options, current_profile(), datasets, out, store, show, not fast)
+    datasets, source = (
+        tuple(read_params(project)["datasets"]),
+        source if "://" in source else str(start_folder / source),
+    )
+
+    def report(line: str) -> None:
+        typer.echo(line, err=True)
+
+    written = stream_files(
+        source, options, current_profile(), datasets, out, store, typer.echo, report, to=to, in_real_time=not fast
+    )
     for line in (*written.verdict, *written.notes, *written.paths):
         typer.echo(line, err=True)
 
@@ -342,7 +341,7 @@ def hands(
     clip: Annotated[str, typer.Option(help="Id of a stored clip whose object and motion to use.")] = "",
     motion: Annotated[str, typer.Option(help="A motion.npz of `hoidata generate` whose object motion to use.")] = "",
     samples: Annotated[int, typer.Option(help="Number of motions to generate.", min=1, max=16)] = 1,
-    seed: Annotated[int, typer.Option(help="Random seed; the same seed gives the same bytes.")] = 0,
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     hand: Annotated[Literal["left", "right", "both"], typer.Option(help="Hands that act.")] = "both",
     length: Annotated[
         float | None, typer.Option(help="Duration in seconds. Default: the duration of the object's motion.")
@@ -355,7 +354,7 @@ def hands(
         str,
         typer.Option(
             help="Lowest and highest hinge angle in degrees, or slide in cm, such as 0:110; 0 is the mesh as stored. "
-            "Default: that of the URDF, as recorded for a dataset's object, or not limited."
+            "Default: the URDF's or the dataset's, else unlimited."
         ),
     ] = "",
     model: Annotated[str, typer.Option(help="Dataset whose networks to use. Default: the first that has them.")] = "",

@@ -1,6 +1,8 @@
 """The stores that ``generate``, ``animate``, ``stream`` and ``hands`` write fit every export, page and metric."""
 
 import json
+import socket
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,7 @@ from pipelines.cli import app
 from pipelines.command_inputs import write_motion_store
 from tests.builders.clips import build_clip
 from tests.builders.stores import write_annotated
+from tests.builders.udp import free_port, send_when_open
 from tests.models.bimart.test_family import PARAMS
 from tests.pipelines.conftest import TINY
 from tests.pipelines.exports import readers
@@ -47,7 +50,7 @@ COMMANDS = {
         "0.5",
     ),
     "animate": ("animate", CLIP),
-    "stream": ("stream", "mine.csv", "--object", "mug.obj", "--world-up", "z"),
+    "stream": ("stream", "--from", "mine.csv", "--object", "mug.obj", "--world-up", "z"),
     "hands": ("hands", "--clip", CLIP, "--samples", "2"),
 }
 
@@ -163,6 +166,37 @@ def test_a_stream_prints_every_pose_and_moves_like_animate(project, stores, monk
         rotvec = np.array([pose[side] for pose in poses]).reshape(FRAMES, 45)
         np.testing.assert_allclose(rotvec, live.clip(live.ids[0]).hands[side].hand_pose, atol=1e-5)
         np.testing.assert_allclose(rotvec, whole.clip(whole.ids[0]).hands[side].hand_pose, atol=1e-4)
+
+
+def test_a_tracker_over_udp_gets_the_poses_of_a_file_and_a_store(project, monkeypatch) -> None:
+    monkeypatch.chdir(project)
+    words = ("stream", "--object", "mug.obj", "--world-up", "z")
+    expected = typed(*words, "--from", "mine.csv", "--out", "out/file", "--fast").splitlines()
+    names, *rows = [line.split(",") for line in Path("mine.csv").read_text().splitlines()]
+    datagrams = [b"nonsense"]
+    for row in rows:
+        columns = dict(zip(names, map(float, row), strict=True))
+        bodies = {body: [columns[f"{body}_{part}"] for part in PARTS] for body in ("object", *SIDES)}
+        datagrams.append(json.dumps({"time_s": columns["time_s"], **bodies}).encode())
+    with socket.socket(type=socket.SOCK_DGRAM) as viewer:
+        viewer.bind(("127.0.0.1", 0))
+        viewer.settimeout(60)
+        port = free_port()
+        tracker = threading.Thread(target=send_when_open, args=(port, [*datagrams, b'{"end": true}']))
+        tracker.start()
+        source, to = f"udp://127.0.0.1:{port}", f"udp://127.0.0.1:{viewer.getsockname()[1]}"
+        lines = typed(*words, "--from", source, "--to", to, "--out", "out/udp", "--store", "stores/udp").splitlines()
+        tracker.join()
+        assert [viewer.recv(4096).decode() for _ in lines] == lines
+    assert len(lines) == len(expected) == FRAMES
+    store = open_store("stores/udp")
+    (clip,) = (store.clip(clip_id) for clip_id in store.ids)
+    for side in SIDES:
+        fingers = [np.array([json.loads(line)[side] for line in given]) for given in (lines, expected)]
+        np.testing.assert_allclose(*fingers, atol=1e-5)
+        np.testing.assert_allclose(clip.hands[side].hand_pose, fingers[0].reshape(FRAMES, 45), atol=1e-5)
+        assert clip.hands[side].valid.all()
+    assert "datagrams were refused" in Path("out/udp/index.html").read_text()
 
 
 def test_a_path_that_exists_is_never_replaced(project, stores, monkeypatch) -> None:

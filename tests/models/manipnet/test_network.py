@@ -1,9 +1,11 @@
 """ManipNet's network has the paper's layers."""
 
 import numpy as np
+import pytest
 import torch
 
 from models.manipnet.network import DenseBlock, ManipNet, NetworkConfig
+from models.manipnet.training import step_loss
 
 SMALL = NetworkConfig(pose=6, trajectory=5, sensors=7, output=4, encoder=8)
 
@@ -72,3 +74,11 @@ def test_an_input_that_hardly_varies_is_scaled_by_the_floor() -> None:
     network.learn_normalisation(inputs, torch.randn(100, 4), (torch.full((18,), 0.05), torch.zeros(4)))
     assert network.input_scale[3] == 0.05
     assert network.input_scale[4] > 0.5
+
+
+def test_the_loss_is_the_mean_square_of_normalised_errors() -> None:
+    torch.manual_seed(0)
+    network, inputs, targets = ManipNet(SMALL).eval(), torch.randn(3, 18), torch.randn(3, 4)
+    network.learn_normalisation(inputs, 5 * targets + 2, (torch.zeros(18), torch.zeros(4)))
+    errors = (network(inputs) - targets).detach().numpy() / network.output_scale.numpy()
+    assert float(step_loss(network, inputs, targets)) == pytest.approx(np.mean(errors**2), rel=1e-5)

@@ -17,7 +17,7 @@ from models.manipnet.control import Control, Motion
 from models.manipnet.features import FeatureSettings
 from models.manipnet.network import NetworkConfig
 from models.manipnet.rollout import Predictor, RolloutTask, roll_out
-from models.manipnet.stream import Stream, TrackedFrame
+from models.manipnet.stream import Sample, Stream, TrackedFrame, add_sample, joined_at
 from models.manipnet.training import NETWORK_ARRAYS, build_network, hand_examples, perturbed_poses, step_loss
 from tests.builders.objects import box_model
 
@@ -313,3 +313,32 @@ def test_an_exchanged_object_is_sensed_and_the_fingers_do_not_jump(trained: Pred
     np.testing.assert_array_equal(same[:46], other[:46])
     assert np.linalg.norm(same - other, axis=-1)[70:].max() > 0.001
     assert largest_step_m(other) < 1.2 * largest_step_m(same)
+
+
+def sample_at(time_s: float, position_m: float, angle_rad: float = 0.0) -> Sample:
+    rotation = rotvec_to_rotmat(np.array([0.0, 0.0, angle_rad]))
+    return Sample(time_s, RigidTransform(rotation, np.array([position_m, 0.0, 0.0])), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("position_m", "angle_rad", "starts_new"),
+    [(0.16, 0.6, False), (0.18, 0.0, True), (0.0, 0.7, True), (0.0, np.pi, True)],
+)
+def test_a_body_faster_than_10_m_or_40_rad_per_second_starts_a_new_trajectory(
+    position_m, angle_rad, starts_new
+) -> None:
+    trajectories: list[list[Sample]] = []
+    for sample in (sample_at(0.0, 0.0), sample_at(1 / 60, position_m, angle_rad)):
+        add_sample(trajectories, sample, 0.5)
+    assert len(trajectories) == (2 if starts_new else 1)
+
+
+def test_the_other_wrist_is_joined_over_gaps_and_cut_at_jumps() -> None:
+    trajectories: list[list[Sample]] = []
+    times_s, positions_m = [0.0, 0.1, 1.1, 1.2, 1.21, 1.3], [0.0, 0.1, 0.2, 0.3, 5.0, 5.1]
+    for time_s, position_m in zip(times_s, positions_m, strict=True):
+        add_sample(trajectories, sample_at(time_s, position_m), 0.5)
+    assert len(trajectories) == 3
+    for now_s, expected in ((-1.0, times_s[:4]), (0.5, times_s[:4]), (1.205, times_s[:4]), (1.25, times_s[4:])):
+        assert [sample.time_s for sample in joined_at(trajectories, now_s)] == expected
+    assert joined_at([], 0.0) == []
