@@ -301,7 +301,6 @@ def stream(
     from hoidata.objects.user_mesh import is_object_path
     from pipelines.animation import AnimationOptions, stream_files
     from pipelines.command_inputs import MeshOptions
-    from pipelines.params import read_params
 
     options = AnimationOptions(
         sides=SIDES if fingers == "both" else (fingers,),
