@@ -157,10 +157,11 @@ class PaperTable:
     def minutes(self, line: Row, results: Results) -> str:
         """Processor minutes of all trainings of the row's package and of its sampling, mean over seeds."""
         graph, sums = f"models/{family_module(line.family).split('.')[1]}/dvc.yaml", []
-        sample = f"{graph}:sample@{self.settings['profile']}-{self.dataset}-{line.family}"
+        sample = f"{graph}:sample@{self.settings['profile']}-{self.dataset}"
         for seconds in (content["seconds"] for content in line.of(results)):
             trained = sum(value for stage, value in seconds.items() if stage.startswith(f"{graph}:train"))
-            sums += [(trained / 60, seconds[sample] / 60)] if sample in seconds else []
+            sampled = seconds.get(f"{sample}-{line.family}", seconds.get(sample, 0))  # a sole family has no suffix
+            sums += [(trained / 60, sampled / 60)] if trained else []
         return " + ".join(f"{mean(values):.1f}" for values in zip(*sums, strict=True)) or "–"
 
     def differences(self, results: Results) -> str:
@@ -192,7 +193,7 @@ def cell(line: Row, results: Results, metric: AnyMetric) -> str:
     if not seeds:
         return line.reason(results, metric.name)
     text, values = number(mean_value(seeds)), {seed["value"] for seed in seeds}
-    if half := half_width(seeds, "repetitions"):
+    if (half := half_width(seeds, "repetitions")) is not None:
         text += f" ± {number(half)}"
     elif ends := [seed["clips"] for seed in seeds if "clips" in seed]:
         text += " ({} to {})".format(*(number(mean(end)) for end in zip(*ends, strict=True)))
