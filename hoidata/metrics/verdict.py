@@ -148,7 +148,9 @@ def _carries(clip: Clip, gap_m: Mapping[Side, np.ndarray]) -> Check:
     words += f" (at most {100 * TRAVEL_M:.0f} cm)"
     if clip.gravity is not None:
         words += f" and is in the air in {frames} frames (at most {MIN_FRAMES - 1})"
-    return Check("carries", travel_m <= TRAVEL_M and frames < MIN_FRAMES, words)
+    floats_at_end = bool(alone[-1] and in_air[-1])
+    words += ", and in the last one" * floats_at_end
+    return Check("carries", travel_m <= TRAVEL_M and frames < MIN_FRAMES and not floats_at_end, words)
 
 
 def _travel_m(paths_m: np.ndarray) -> float:
