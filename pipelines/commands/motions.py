@@ -359,7 +359,7 @@ def hands(
     model: Annotated[str, typer.Option(help="Dataset whose networks to use. Default: the first that has them.")] = "",
     profile: Profile = "",
 ) -> None:
-    """Generate hand motion for a given object motion; write arrays, an animated GLB per sample and a web page."""
+    """Generate hands for an object's motion, with networks of bimart, which `make demo` does not train."""
     object = _absolute(object)
     keyframes, motion = (name and str(Path(name).absolute()) for name in (keyframes, motion))
     project = _project(profile)
