@@ -150,29 +150,29 @@ FUNCTION_WORDS = frozenset(re.findall(r"\w+", _FUNCTION_WORDS))
 
 
 def unseen_words(
-    known: Vocabulary, text: str, verb: str | None, thing: str | None, hand: HandType, encoder: TextEncoder
+    known: Vocabulary, text: str, verb: str | None, noun: str | None, hand: HandType, encoder: TextEncoder
 ) -> list[str]:
     """What of a sentence was not in training, with the most similar training words; in words for the user."""
-    thing = thing or _known_object(known, text)
+    noun = noun or _known_object(known, text)
     notes = []
     if not verb or verb not in known.verbs:
         word = verb or first_verb(text)
         notes.append(_stranger("verb", word, known.verbs, encoder))
-    if not thing or thing not in known.objects:
-        notes.append(_stranger("object", thing, known.objects, encoder))
+    if not noun or noun not in known.objects:
+        notes.append(_stranger("object", noun, known.objects, encoder))
     if notes:
         return notes
-    if not any(key[:2] == (verb, thing) for key in known.counts):
-        return [f"{verb!r} and {thing!r} were each in training, never together"]
-    if (verb, thing, hand) not in known.counts:
-        return [f"{verb!r} with {thing!r} was in training, never with hand type {hand!r}"]
+    if not any(key[:2] == (verb, noun) for key in known.counts):
+        return [f"{verb!r} and {noun!r} were each in training, never together"]
+    if (verb, noun, hand) not in known.counts:
+        return [f"{verb!r} with {noun!r} was in training, never with hand type {hand!r}"]
     return []
 
 
 def _known_object(known: Vocabulary, text: str) -> str | None:
     """The longest name of a training object in ``text``; also found in a sentence with an unknown verb."""
-    found = [thing for thing in known.objects if thing and re.search(rf"\b{re.escape(thing)}\b", text.lower())]
-    return max(found, key=len, default=None)
+    matches = [noun for noun in known.objects if noun and re.search(rf"\b{re.escape(noun)}\b", text.lower())]
+    return max(matches, key=len, default=None)
 
 
 def _stranger(kind: str, word: str | None, known: Mapping[str, int], encoder: TextEncoder) -> str:
@@ -207,12 +207,12 @@ def further_verbs(text: str, made: str | None, known: Vocabulary) -> list[str]:
     clauses = [rest for words in clauses if (rest := words[_count_adverbs(words) :])]
     verbs = sorted(filter(None, known.verbs))
     ordered = bool(clauses) and _is_base_form(clauses[0][0])  # "Lift ..." and not "A hand lifts ..."
-    found = []
+    matches = []
     for number, words in enumerate(clauses):
         starts = range(1) if ordered or number else _of_no_article(words)
-        told = (verb for start in starts for verb in verbs if _begins_with(words[start:], verb, known, ordered))
-        found += [verb for verb in (next(told, None),) if verb and verb != made]
-    return list(dict.fromkeys(found))
+        begun = (verb for start in starts for verb in verbs if _begins_with(words[start:], verb, known, ordered))
+        matches += [verb for verb in (next(begun, None),) if verb and verb != made]
+    return list(dict.fromkeys(matches))
 
 
 def _count_adverbs(words: list[str]) -> int:

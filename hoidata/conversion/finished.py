@@ -47,7 +47,7 @@ SHARED = {("ObjectModel", "vertices_m"), ("ObjectModel", "faces"), ("ObjectModel
 
 
 class Packer:
-    """Converts values to JSON and collects their arrays by name."""
+    """Converts values to JSON and collects their named arrays."""
 
     def __init__(self, store_shared: Callable[[np.ndarray], str]) -> None:
         """store_shared: stores an array outside of ``arrays`` and returns its name."""

@@ -70,9 +70,9 @@ def parse_frame(data: bytes, is_hinged: bool = False) -> TrackedFrame | None:
 
 def _numbers(values: Mapping[str, object], name: str, count: int) -> np.ndarray:
     """(count,) numbers; NaN if there are none."""
-    given = values.get(name)
-    numbers = [given] if count == 1 else given
-    if given is None:
+    value = values.get(name)
+    numbers = [value] if count == 1 else value
+    if value is None:
         return np.full(count, np.nan)
     if isinstance(numbers, list) and len(numbers) == count and all(type(one) in (int, float) for one in numbers):
         with suppress(OverflowError):
