@@ -245,7 +245,7 @@ def _in_time(clips: pd.DataFrame, rule: SplitRule) -> list[Part | None]:
     parts: list[Part | None] = [None] * len(clips)
     ordered = clips.sort_values(["sequence", "first_source_frame", "clip_id"], kind="stable")
     for _, group in ordered.groupby("sequence"):
-        rounds = [ROUND[number % len(ROUND)] for number in range(len(group))]
+        rounds: Sequence[Part] = [ROUND[number % len(ROUND)] for number in range(len(group))]
         group_parts = rounds if rule.by == "rounds" else _by_share(len(group), rule)
         for clip, part in zip(group.index, group_parts, strict=True):
             parts[clip] = part
