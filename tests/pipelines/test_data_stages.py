@@ -42,9 +42,11 @@ def params_of(folder: Path, text: str) -> ConvertSettings:
     return load_settings(ConvertSettings, "convert", path)
 
 
-def test_the_committed_settings_are_the_defaults_of_all_adapters():
-    params = load_settings(ConvertSettings, "convert", PROJECT / "params.yaml")
-    assert params.adapter("grab") == GrabAdapter()
+def test_the_committed_settings_are_the_defaults_of_all_adapters_but_for_embedded_margins(tmp_path):
+    path = PROJECT / "params.yaml"
+    own = params_of(tmp_path, path.read_text().replace("profile: embedded", "profile: own", 1))
+    assert own.adapter("grab") == GrabAdapter()
+    assert load_settings(ConvertSettings, "convert", path).adapter("grab") == GrabAdapter(margin_frames=10)
 
 
 def test_a_dataset_may_set_its_margin(tmp_path):
@@ -306,7 +308,8 @@ def test_all_stages_that_open_the_annotated_store_depend_on_its_split(pytestconf
         out = f"data/embedded/{name}/splits"
         assert producer_of[out].name == f"split@embedded-{name}"
         readers = {stage.name.rpartition(":")[2].split("@")[0] for stage in graph.values() if out in stage.deps}
-        assert readers == {"train", "train-diffusion", "train-refiner", "sample", "evaluate", "evaluator", "controls"}
+        networks = {f"train-{network}" for network in ("contact", "length", "diffusion", "refiner")}
+        assert readers == {*networks, "sample", "evaluate", "evaluator", "controls"}
 
 
 def test_the_project_chooses_a_split_each_dataset_has(pytestconfig):

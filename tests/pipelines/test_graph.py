@@ -135,11 +135,10 @@ def test_deployments_are_the_stages_of_the_graph_by_dataset_and_family(graph):
     assert targets["full-graph"] == []
     assert targets["annotate-arctic"] == ["annotate@{profile}-arctic"]
     assert targets["evaluate-h2o"] == ["evaluate@{profile}-h2o"]
-    at = "models/text2hoi/dvc.yaml:train"
-    networks = [f"{at}@{{profile}}-grab-contact", f"{at}@{{profile}}-grab-length"]
-    assert sorted(targets["train-grab-text2hoi"]) == sorted(
-        [*networks, f"{at}-diffusion@{{profile}}-grab", f"{at}-refiner@{{profile}}-grab"]
-    )
+    assert sorted(targets["train-grab-text2hoi"]) == [
+        f"models/text2hoi/dvc.yaml:train-{network}@{{profile}}-grab"
+        for network in ("contact", "diffusion", "length", "refiner")
+    ]
     assert {
         target.replace("{profile}", params["profile"]) for targets in targets.values() for target in targets
     } <= set(graph)

@@ -35,7 +35,7 @@ SHOWN_ON_PURPOSE = {"annotate.encoder"}
 # Constants with the value of the contact threshold and another meaning.
 OTHER_LENGTHS = {
     "LONGEST_EDGE_M", "STAND_RADIUS_M", "LARGEST_DISTANCE_M", "REACH_M", "HANDS_BELOW", "TOUCH_M",
-    "GUIDANCE_RANGE_M", "MAX_BELOW_FRACTION", "FADES_M", "DEEP_M", "FLOATING_M",
+    "GUIDANCE_RANGE_M", "MAX_BELOW_FRACTION", "FADES_M", "DEEP_M", "TRAVEL_M",
     "STILL_M_S", "MOVING_M_S",
 }  # fmt: skip
 

@@ -85,5 +85,5 @@ def test_show_writes_a_page_of_a_clip_in_a_store_and_lists_the_clips_for_an_unkn
     assert "SYNTHETIC" in page.read_text()
     with pytest.raises(BadInput, match="closest"):
         typed("show", "grab/s99/mug_drink_1", "--data", store)
-    with pytest.raises(BadInput, match="a clip's id, a dataset's name, or --data FOLDER"):
+    with pytest.raises(BadInput, match=r"a clip's id, a dataset's name, or \(without --figures\) --data FOLDER"):
         typed("show")

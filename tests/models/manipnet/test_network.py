@@ -81,4 +81,4 @@ def test_the_loss_is_the_mean_square_of_normalised_errors() -> None:
     network, inputs, targets = ManipNet(SMALL).eval(), torch.randn(3, 18), torch.randn(3, 4)
     network.learn_normalisation(inputs, 5 * targets + 2, (torch.zeros(18), torch.zeros(4)))
     errors = (network(inputs) - targets).detach().numpy() / network.output_scale.numpy()
-    assert float(step_loss(network, inputs, targets)) == pytest.approx(np.mean(errors**2), rel=1e-5)
+    assert step_loss(network, inputs, targets).item() == pytest.approx(np.mean(errors**2), rel=1e-5)
