@@ -44,8 +44,8 @@ def params_of(folder: Path, text: str) -> ConvertSettings:
 
 def test_the_committed_settings_are_the_defaults_of_all_adapters_but_for_embedded_margins(tmp_path):
     path = PROJECT / "params.yaml"
-    own = params_of(tmp_path, path.read_text().replace("profile: embedded", "profile: own", 1))
-    assert own.adapter("grab") == GrabAdapter()
+    licensed = params_of(tmp_path, path.read_text().replace("profile: embedded", "profile: own", 1))
+    assert licensed.adapter("grab") == GrabAdapter()
     assert load_settings(ConvertSettings, "convert", path).adapter("grab") == GrabAdapter(margin_frames=10)
 
 
