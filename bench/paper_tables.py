@@ -38,9 +38,8 @@ LEGEND = (
 )
 # ``results.json``: by ``<run> <seed>`` the digest of its settings, processor seconds by stage, and metrics by method.
 Results = Mapping[str, Mapping[str, Any]]
-Seeds = Sequence[
-    Mapping[str, Any]
-]  # by seed: ``value`` and its intervals ``repetitions`` and ``clips``, if there are any
+# By seed: ``value``, and its intervals ``repetitions`` and ``clips`` if there are any.
+Seeds = Sequence[Mapping[str, Any]]
 
 
 @dataclass(frozen=True)

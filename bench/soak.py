@@ -202,7 +202,7 @@ def soak(predictor: Predictor, hands: Mapping[Side, TrackedHand], controls: Sequ
     for fault in faults:
         with_fault(faulty_frames, fault)
         if fault.kind == "other object":
-            model = controls[np.searchsorted(firsts, fault.stop, side="right") - 1].model
+            model = controls[int(np.searchsorted(firsts, fault.stop, side="right")) - 1].model
             for number, exchanged in ((fault.start, box((0.02, 0.02, 0.3))), (fault.stop, model)):
                 faulty_objects.setdefault(number, []).append((fault.side, exchanged))
     return compare(clean, play(predictor, hands, faulty_frames, faulty_objects), faults, 1 / predictor.settings.step_s)
@@ -256,10 +256,8 @@ def main() -> None:
     acting = [clip_id for clip_id in clips.store.ids if clips.hand_types.at[clip_id, "hand_type"] in ("right", "both")]
     ids = np.resize(np.random.default_rng(0).permutation(acting), count)
     controls = [forward_and_back(control_from_clip(clips.clip(clip_id)), CLIP_S) for clip_id in ids]
-    result, rows = (
-        soak(Predictor(checkpoint.network), hands_of(pair, np.zeros((2, 10), np.float32), None), controls),
-        [],
-    )
+    result = soak(Predictor(checkpoint.network), hands_of(pair, np.zeros((2, 10), np.float32), None), controls)
+    rows = []
     for kind in KINDS:
         chosen = np.array([fault.kind == kind for fault in result.faults])
         if chosen.any():

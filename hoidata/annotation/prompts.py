@@ -150,28 +150,28 @@ FUNCTION_WORDS = frozenset(re.findall(r"\w+", _FUNCTION_WORDS))
 
 
 def unseen_words(
-    known: Vocabulary, text: str, verb: str | None, noun: str | None, hand: HandType, encoder: TextEncoder
+    vocabulary: Vocabulary, text: str, verb: str | None, noun: str | None, hand: HandType, encoder: TextEncoder
 ) -> list[str]:
     """What of a sentence was not in training, with the most similar training words; in words for the user."""
-    noun = noun or _known_object(known, text)
+    noun = noun or _known_object(vocabulary, text)
     notes = []
-    if not verb or verb not in known.verbs:
+    if not verb or verb not in vocabulary.verbs:
         word = verb or first_verb(text)
-        notes.append(_stranger("verb", word, known.verbs, encoder))
-    if not noun or noun not in known.objects:
-        notes.append(_stranger("object", noun, known.objects, encoder))
+        notes.append(_stranger("verb", word, vocabulary.verbs, encoder))
+    if not noun or noun not in vocabulary.objects:
+        notes.append(_stranger("object", noun, vocabulary.objects, encoder))
     if notes:
         return notes
-    if not any(key[:2] == (verb, noun) for key in known.counts):
+    if not any(key[:2] == (verb, noun) for key in vocabulary.counts):
         return [f"{verb!r} and {noun!r} were each in training, never together"]
-    if (verb, noun, hand) not in known.counts:
+    if (verb, noun, hand) not in vocabulary.counts:
         return [f"{verb!r} with {noun!r} was in training, never with hand type {hand!r}"]
     return []
 
 
-def _known_object(known: Vocabulary, text: str) -> str | None:
+def _known_object(vocabulary: Vocabulary, text: str) -> str | None:
     """The longest name of a training object in ``text``; also found in a sentence with an unknown verb."""
-    matches = [noun for noun in known.objects if noun and re.search(rf"\b{re.escape(noun)}\b", text.lower())]
+    matches = [noun for noun in vocabulary.objects if noun and re.search(rf"\b{re.escape(noun)}\b", text.lower())]
     return max(matches, key=len, default=None)
 
 
@@ -201,16 +201,16 @@ def read_sentence(text: str) -> tuple[str | None, str | None]:
     return reading.verb, reading.object_words
 
 
-def further_verbs(text: str, made: str | None, known: Vocabulary) -> list[str]:
+def further_verbs(text: str, made: str | None, vocabulary: Vocabulary) -> list[str]:
     """Training verbs in a sentence in addition to the generated one, such as "pour" in "Lift a mug and pour"."""
     clauses = [re.findall(r"[a-z-]+", clause) for clause in _BETWEEN_CLAUSES.split(text.lower())]
     clauses = [rest for words in clauses if (rest := words[_count_adverbs(words) :])]
-    verbs = sorted(filter(None, known.verbs))
+    verbs = sorted(filter(None, vocabulary.verbs))
     ordered = bool(clauses) and _is_base_form(clauses[0][0])  # "Lift ..." and not "A hand lifts ..."
     matches = []
     for number, words in enumerate(clauses):
         starts = range(1) if ordered or number else _of_no_article(words)
-        begun = (verb for start in starts for verb in verbs if _begins_with(words[start:], verb, known, ordered))
+        begun = (verb for start in starts for verb in verbs if _begins_with(words[start:], verb, vocabulary, ordered))
         matches += [verb for verb in (next(begun, None),) if verb and verb != made]
     return list(dict.fromkeys(matches))
 
@@ -220,11 +220,11 @@ def _count_adverbs(words: list[str]) -> int:
     return next((n for n, word in enumerate(words) if not (word.endswith("ly") or word in _ADVERBS)), len(words))
 
 
-def _begins_with(words: list[str], verb: str, known: Vocabulary, ordered: bool) -> bool:
+def _begins_with(words: list[str], verb: str, vocabulary: Vocabulary, ordered: bool) -> bool:
     """Whether words begin with a known verb, and not with an object's name; in base form if ``ordered``."""
     first, *others = verb.split()
     fits = words[0] == first if ordered else first in getAllLemmas(words[0]).get("VERB", ())
-    if not fits or words[0] in known.objects:
+    if not fits or words[0] in vocabulary.objects:
         return False
     of_hand = first in ("hand", "use") and {"hand", "hands"} & set(words[1:4])  # "and use both hands"
     return not of_hand and all(other in words[1:6] for other in others)

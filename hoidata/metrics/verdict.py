@@ -147,9 +147,9 @@ def _carries(clip: Clip, gap_m: Mapping[Side, np.ndarray]) -> Check:
     words = f"without a hand within {100 * GAP_M:.0f} cm the object moves {100 * travel_m:.1f} cm"
     words += f" (at most {100 * TRAVEL_M:.0f} cm)"
     if clip.gravity is not None:
-        words += f" and is in the air in {frames} frames (at most {MIN_FRAMES - 1})"
+        words += f"; frames in the air: {frames} (at most {MIN_FRAMES - 1})"
     floats_at_end = bool(alone[-1] and in_air[-1])
-    words += ", and in the last one" * floats_at_end
+    words += ", and the last frame" * floats_at_end
     return Check("carries", travel_m <= TRAVEL_M and frames < MIN_FRAMES and not floats_at_end, words)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from pipelines.commands.project import current_profile, enter_project, hands_of
+from pipelines.commands.project import enter_project, hands_of
 from pipelines.params import read_params
 
 if TYPE_CHECKING:
@@ -296,30 +296,25 @@ def stream(
 
     Prints a pose per line: time_s, axis-angles (15, 3) of each hand. Then writes what `animate` does.
     """
-    start_folder, project = Path.cwd(), enter_project()
+    object = _absolute(object)
+    source = source if "://" in source else str(Path(source).absolute())
+    project = _project("")
     from hoidata.clips.clip import SIDES
-    from hoidata.objects.user_mesh import is_object_path
     from pipelines.animation import AnimationOptions, stream_files
     from pipelines.command_inputs import MeshOptions
 
     options = AnimationOptions(
         sides=SIDES if fingers == "both" else (fingers,),
         model=model,
-        object=str(start_folder / object) if is_object_path(str(start_folder / object)) else object,
+        object=object,
         up=world_up,
         mesh=MeshOptions(unit, "", hinge, moving),
-    )
-    datasets, source = (
-        tuple(read_params(project)["datasets"]),
-        source if "://" in source else str(start_folder / source),
     )
 
     def report(line: str) -> None:
         typer.echo(line, err=True)
 
-    written = stream_files(
-        source, options, current_profile(), datasets, out, store, typer.echo, report, to=to, in_real_time=not fast
-    )
+    written = stream_files(source, options, *project, out, store, typer.echo, report, to=to, in_real_time=not fast)
     for line in (*written.verdict, *written.notes, *written.paths):
         typer.echo(line, err=True)
 

@@ -149,8 +149,8 @@ def test_a_ball_lifted_without_contact_is_not_carried() -> None:
     assert failed(checks) == ["touches", "carries"]
     in_air = int((RISE > 0.02).sum())
     assert checks["carries"].words == (
-        "without a hand within 1 cm the object moves 20.0 cm (at most 2 cm) "
-        f"and is in the air in {in_air} frames (at most 2), and in the last one"
+        "without a hand within 1 cm the object moves 20.0 cm (at most 2 cm); "
+        f"frames in the air: {in_air} (at most 2), and the last frame"
     )
 
 
@@ -158,7 +158,7 @@ def test_an_object_that_floats_in_the_last_frame_is_reported() -> None:
     hand_rise = RISE + np.where(np.arange(FRAMES) == FRAMES - 1, 0.03, 0.0)
     check = checks_of(lift(hand_rise_m=hand_rise))["carries"]
     assert check.passed is False
-    assert check.words.endswith("is in the air in 1 frames (at most 2), and in the last one")
+    assert check.words.endswith("frames in the air: 1 (at most 2), and the last frame")
 
 
 @pytest.mark.parametrize("way_m", [0.018, 0.022])

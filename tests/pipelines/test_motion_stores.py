@@ -157,7 +157,7 @@ def test_a_generated_motion_keeps_the_verb_and_the_sentence(stores) -> None:
 def test_a_stream_prints_every_pose_and_moves_like_animate(project, stores, monkeypatch) -> None:
     monkeypatch.chdir(project)
     words = COMMANDS["stream"][1:]
-    typed("animate", *words, "--out", "out/all-at-once", "--store", "stores/all-at-once")
+    typed("animate", *words[1:], "--out", "out/all-at-once", "--store", "stores/all-at-once")
     whole, live = (open_store(project / "stores" / name) for name in ("all-at-once", "stream"))
     lines = typed("stream", *words, "--out", "out/again", "--fast").splitlines()
     poses = [json.loads(line) for line in lines]
