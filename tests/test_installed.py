@@ -59,9 +59,9 @@ def test_a_project_of_the_wheel_gives_the_bytes_of_a_clone(python, tmp_path, sma
     assert run(python, tmp_path, "-m", "hoidata", "init", "project").returncode == 0
     for path in (project / "manifests/embedded").glob("*.json"):
         path.write_text(path.read_text().replace('"size": "full"', '"size": "small"'))
-    done = run(python, project, "-m", "hoidata", "repro", "convert@embedded-grab")
+    done = run(python, project, "-m", "hoidata", "repro", "convert@embedded-h2o")
     assert done.returncode == 0, done.stdout + done.stderr
-    reference, clips = small_corpus("grab").clips, project / "data/embedded/grab/clips"
+    reference, clips = small_corpus("h2o").clips, project / "data/embedded/h2o/clips"
     names = sorted(path.relative_to(reference) for path in reference.rglob("*") if path.is_file())
     assert names == sorted(path.relative_to(clips) for path in clips.rglob("*") if path.is_file())
     assert filecmp.cmpfiles(reference, clips, names, shallow=False)[1:] == ([], [])
