@@ -1,7 +1,7 @@
-"""The verdict on one motion: five checks with their number and threshold, in words.
+"""The verdict on one motion: six checks with their number and threshold, in words.
 
-The hands touch the object, carry it, and do not pierce it. The object stands upright in the first frame, and its motion
-shows the verb. A check that cannot be measured states the reason.
+The hands touch the object, carry it, and do not pierce it. The object stands upright in the first frame, does not sink
+into what it stands on, and its motion shows the verb. A check that cannot be measured states the reason.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -27,6 +27,7 @@ DEEP_M = 0.02  # a finger's thickness
 THROUGH_DEG = 120.0  # between the normals where a finger or palm enters and leaves: not over an edge
 TRAVEL_M = 0.02  # an object this far above its start is in the air; one that goes this far without a hand is seen to
 MIN_FRAMES = 3  # a tenth of a second; a shorter fault is not visible
+SINK_M = 0.01  # below where the object stood: visible at its edge
 STILL_M = 0.01  # an object of which no point moves farther does not move
 TILT_DEG = 20.0  # an object that leans more does not stand upright
 ALIKE = 0.03  # of the size: an object is the same shape in two rotations if its surfaces differ by less
@@ -102,6 +103,7 @@ def verdict(
         _carries(clip, gap_m),
         _does_not_pierce(clip, hands, {side: hand for side, hand in placed.items() if side in sides}, index),
         _stands_upright(clip, up),
+        _does_not_sink(clip, gap_m),
         _does_the_verb(clip, requested),
     )
 
@@ -234,6 +236,20 @@ def _stands_upright(clip: Clip, up: np.ndarray | Unmeasured) -> Check:
     if tilt_deg > TILT_DEG and _looks_alike(clip, up, actual):
         return Check(name, True, f"{words}, where it looks the same as upright")
     return Check(name, tilt_deg <= TILT_DEG, words)
+
+
+def _does_not_sink(clip: Clip, gap_m: Mapping[Side, np.ndarray]) -> Check:
+    """An object that no hand holds in the first frame stands on something, which it must not go into."""
+    name = "does not sink"
+    if clip.gravity is None:
+        return Check(name, None, NO_GRAVITY.reason)
+    if any(gap[0] <= GAP_M for gap in gap_m.values()):
+        return Check(name, None, "a hand is at the object in the first frame, so it need not stand on anything")
+    lowest_m = (_vertex_paths_m(clip) @ -np.asarray(clip.gravity, np.float64)).min(axis=1)
+    below_m = lowest_m[0] - lowest_m
+    frames = int((below_m > SINK_M).sum())
+    words = f"{100 * below_m.max():.1f} cm below where it stood at most, deeper than {100 * SINK_M:.0f} cm in {frames}"
+    return Check(name, frames < MIN_FRAMES, f"{words} frames (at most {MIN_FRAMES - 1})")
 
 
 def _looks_alike(clip: Clip, up: np.ndarray, actual: np.ndarray) -> bool:
