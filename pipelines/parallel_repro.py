@@ -112,6 +112,7 @@ class Plan:
 
     upstream: Upstream  # each stage with the stages that it waits for
     certain: frozenset[str]  # the changed stages; the others run if a stage before them writes other bytes
+    growth: Mapping[str, float] = field(default_factory=dict)  # by training: its steps / those of its last run
 
 
 def stale_stages(targets: list[str], force: bool = False) -> Plan:
@@ -201,7 +202,8 @@ def _progress_line(name: str) -> str:
 
 def describe_plan(plan: Plan, jobs: int) -> str:
     """One line per stage of a plan with its likely minutes, and their sum."""
-    seconds = likely_seconds(plan.upstream)
+    last = likely_seconds(plan.upstream)
+    seconds = {name: value * plan.growth.get(name, 1.0) for name, value in last.items()}
 
     def minutes(names: Collection[str]) -> str:
         unknown = sum(name not in seconds for name in names)

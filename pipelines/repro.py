@@ -2,11 +2,14 @@
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from hoidata.errors import BadInput, MissingResource
 from pipelines.lineage.graph import look_up, read_graph, written_graph
+from pipelines.lineage.locks import read_locks
 from pipelines.lineage.manifests import read_manifest
 from pipelines.parallel_repro import Plan, Run, RunStage, reproduce_in_parallel, stale_stages
 from pipelines.params import read_file, read_params
@@ -44,7 +47,26 @@ def plan(targets: list[str], force: bool = False) -> Plan:
     """The stages that ``reproduce`` would run; writes the digests of the code, which tell DVC what has changed."""
     require_settings(Path())
     code.run(StagePaths(""))
-    return stale_stages(targets, force)
+    stale = stale_stages(targets, force)
+    return replace(stale, growth=steps_growth(Path(), stale.upstream))
+
+
+def steps_growth(root: Path, names: Iterable[str]) -> dict[str, float]:
+    """By training among the stages ``names``: its steps in params.yaml divided by those of its last run."""
+    graph, locks, values = written_graph(root), read_locks(root), read_file(root / "params.yaml")
+    growth = {}
+    for name in (name for name in names if name in graph and name in locks):
+        now = _steps({key: look_up(values, key) for key in graph[name].params})
+        before = _steps(locks[name].params)
+        growth |= {name: now / before} if now and before else {}
+    return growth
+
+
+def _steps(sections: Mapping[str, Any]) -> int:
+    """The training steps in sections of params.yaml by key, 0 without any; a size overrides a preset."""
+    by_size = sorted(sections, key=lambda key: key.startswith(("train.small", "train.full")))
+    trainings = [sections[key].get("training") or {} for key in by_size if isinstance(sections[key], Mapping)]
+    return next((training["steps"] for training in reversed(trainings) if "steps" in training), 0)
 
 
 def stage_environment() -> dict[str, str]:

@@ -36,12 +36,20 @@ COLUMNS = {
     "Con": ("bimart_con_corrected", 0),
     "Art": ("bimart_art_corrected", 0),
     "Pen": ("bimart_pen_1cm_corrected", 1),
+    "CM": ("bimart_cm_corrected", 1),
+    "Mul": ("bimart_mul_cm", 2),
     "acceleration": ("bimart_accel_corrected", 1),
     "deep": ("deep_share", 3),
     "slip": ("slip_cm_s", 1),
     "realism": ("realism_si", 2),
     "jitter": ("jitter_m_s3", 0),
     "joints": ("joint_error_mm", 0),
+    # As BimArt's release defines them.
+    "Con, released": ("bimart_con_paper", 1),
+    "Art, released": ("bimart_art_paper", 1),
+    "Pen, released": ("bimart_pen_1cm_paper", 1),
+    "CM, released": ("bimart_cm_paper", 1),
+    "acceleration, released": ("bimart_accel_paper", 3),
 }
 TEXT = {
     "ground-truth": "recorded",
@@ -64,6 +72,25 @@ CONTROLS = {
     "pressed": "hands pressed in by 10 mm",
     "noise": "noise on hands",
 }
+# Rows of BimArt's Tables 1 and 3 (bench/bimart_tables.py).
+WINDOWS = {
+    "ground-truth": "recorded",
+    "paper": "**BimArt, `paper`**",
+    "paper-guided": "the same, not refined",
+    "paper-with-contact": "nor guided by contact",
+    "paper-without-contact": "nor with contact maps",
+    "ours": "**BimArt, `ours`**",
+    "ours-unrefined": "the same, not refined",
+    "nearest-window": "nearest training window",
+    "nearest-window-refined": "the same, refined",
+    "mdm-b": "MDM-B",
+    "omomo-b": "OMOMO-B",
+    "cams-b": "CAMS-B",
+    "mean-pose": "mean pose at the object",
+    "hands-shifted": "recorded, hands 3 cm aside",
+    "pressed-deep": "recorded, hands 3 cm deeper",
+}
+NOT_RANKED = frozenset({RECORDED, "mean-pose", "hands-shifted", "pressed-deep", "cams-b"})  # cams-b sees recorded hands
 OF_TEXT = ("verb success", "verb accuracy", "contact F1", "adherence", "deep", "slip", "realism", "jitter", "joints")
 
 
@@ -104,6 +131,19 @@ TABLES = {
         ("contact F1", "Con", "Art", "Pen", "acceleration", "slip", "realism", "jitter", "joints"),
         unranked=frozenset({RECORDED, "mean-pose-at-object", "manipnet"}),  # manipnet is given the wrists
     ),
+    "arctic-windows": Table(
+        {"arctic-windows": ""},
+        WINDOWS,
+        ("Mul", "acceleration", "Pen", "Con", "Art", "CM", "contact F1"),
+        unranked=NOT_RANKED,
+    ),
+    "arctic-windows-released": Table(
+        {"arctic-windows": ""},
+        WINDOWS,
+        ("Mul", "acceleration, released", "Pen, released", "Con, released", "Art, released", "CM, released"),
+        intervals=False,
+        unranked=frozenset(WINDOWS),
+    ),
     "arctic-controls": Table(
         {"arctic": ""},
         CONTROLS,
@@ -113,7 +153,7 @@ TABLES = {
     ),
     "embedded": Table(
         {"embedded-h2o": "H2O", "embedded-grab": "GRAB", "embedded-arctic": "ARCTIC"},
-        {family: title for family, title in TEXT.items() if family != "prompt-retrieval-refined"},
+        {family: title for family, title in TEXT.items() if family not in ("prompt-retrieval-refined", "mean-motion")},
         OF_TEXT,
         intervals=False,
     ),

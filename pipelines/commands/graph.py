@@ -13,7 +13,7 @@ def repro(
     ] = None,
     jobs: Annotated[int, typer.Option(help="Number of parallel stages; 0 means one per core, at most 4.", min=0)] = 0,
     force: Annotated[bool, typer.Option("--force", help="Run the targets even if nothing has changed.")] = False,
-    dry: Annotated[bool, typer.Option("--dry", help="Only list these stages with the minutes of their last runs.")] = False,
+    dry: Annotated[bool, typer.Option("--dry", help="Only list these stages with likely minutes.")] = False,
 ) -> None:
     """Run all stages whose inputs have changed, in parallel; first check that the raw files exist."""
     enter_project()

@@ -33,6 +33,7 @@ from pipelines.parallel_repro import (
     run_all,
     stale_stages,
 )
+from pipelines.repro import steps_growth
 from pipelines.sidecar import RUNS
 
 PROJECT = Path(__file__).parents[2]
@@ -123,6 +124,31 @@ def test_a_plan_lists_each_stage_with_the_minutes_of_its_last_run_or_of_its_kind
         "        ?  b@x  (if its inputs change)",
         "3 stages: 5.0 min and 1 unknown, 3.0 min with 2 in parallel; 2 stages are certain: 5.0 min",
     ]
+    halved = Plan({"a@x": frozenset()}, frozenset({"a@x"}), {"a@x": 0.5})
+    assert describe_plan(halved, jobs=1).splitlines()[0] == "  1.0 min  a@x"
+
+
+TRAIN_STAGE = """
+stages:
+  train:
+    matrix: {{net: [a, b]}}
+    cmd: train ${{item.net}}
+    params: [train.seed, "train.ours.${{item.net}}", "train.{size}.${{item.net}}"]
+"""
+
+
+@pytest.mark.parametrize("size", ["small", "full"])
+def test_a_training_grows_with_its_steps(tmp_path, size):
+    def sections(**steps):
+        return {net: {"training": {"steps": count}} for net, count in steps.items()}
+
+    (tmp_path / "dvc.yaml").write_text(TRAIN_STAGE.format(size=size))
+    params = {"train": {"seed": 0, "ours": {**sections(a=7), "b": {"training": None}}, size: sections(a=50, b=300)}}
+    (tmp_path / "params.yaml").write_text(json.dumps(params))
+    last = {"train.seed": 0, "train.ours.a": {"training": {"steps": 9}}, f"train.{size}.a": sections(a=200)["a"]}
+    lock = {"train@a": {"cmd": "train a", "params": {"params.yaml": last}}, "train@b": {"cmd": "train b"}}
+    (tmp_path / "dvc.lock").write_text(json.dumps({"schema": "2.0", "stages": lock}))
+    assert steps_growth(tmp_path, ["train@a", "train@b", "other"]) == {"train@a": 0.25}  # b's lock has no steps
 
 
 def test_the_progress_of_a_running_training_is_repeated_once_per_line(monkeypatch, capfd):
