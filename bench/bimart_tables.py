@@ -161,7 +161,9 @@ class Run:
         if not counts["clips"]:
             return read_json(folder / "empty.json")
         sampled_s = time.process_time()
-        result = evaluate_store(folder / "clips", self.data, self.hands, metrics=select_metrics(["bimart"]))
+        shown = {name for columns in TABLES.values() for name in columns.values()}
+        metrics = tuple(metric for metric in select_metrics(["bimart"]) if metric.name in shown)
+        result = evaluate_store(folder / "clips", self.data, self.hands, metrics=metrics)
         seconds = sampled_s - start_s, time.process_time() - sampled_s
         result["seconds"] = [None if is_continued else seconds[0] / result["motions"], seconds[1] / result["motions"]]
         write_whole(path, canonical_json(result))
