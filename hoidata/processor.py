@@ -2,7 +2,8 @@
 
 NumPy and OpenBLAS choose kernels by processor, and the kernels differ in the last bits. The variables select the
 fastest kernels that all AVX2 processors have. They are read when the libraries are loaded, so they must be set before.
-Torch still chooses by processor: bits of networks depend on the processor, bits of data do not.
+Torch still chooses by processor, so bits of networks depend on it. Bits of data do not: where torch computes hands for
+them, NumPy multiplies the matrices (``hoidata.hands.kinematics``).
 """
 
 import platform

@@ -6,12 +6,23 @@ World convention of hoidata: joint 0 is at ``wrist_m``, and the hand rotates abo
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hoidata.hands.model import N_ROTATIONS, N_SHAPE, PARENTS, TIP_VERTICES, HandModel
 
 _LEVELS = ((1, 4, 7, 10, 13), (2, 5, 8, 11, 14), (3, 6, 9, 12, 15))
+
+
+def product(left: Tensor, right: Tensor) -> Tensor:
+    """Matrix product. On the CPU without gradients NumPy computes it: its bits do not depend on the processor.
+
+    torch's library (MKL) chooses kernels by processor; NumPy's are fixed (``hoidata.processor``).
+    """
+    if left.device.type != "cpu" or torch.is_grad_enabled():
+        return left @ right
+    return torch.from_numpy(np.matmul(left.numpy(), right.numpy()))
 
 
 class HandKinematics(nn.Module):
@@ -68,8 +79,8 @@ class HandKinematics(nn.Module):
         self, wrist_m: Tensor, rotmats: Tensor, betas: Tensor, template_m: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """World rotations (batch, 16, 3, 3) and positions (batch, 16, 3) of the joints, and the rest joints."""
-        base = self.rest_joints_m if template_m is None else self.joint_regressor @ template_m
-        rest = base + (betas @ self.joint_directions).reshape(-1, N_ROTATIONS, 3)
+        base = self.rest_joints_m if template_m is None else product(self.joint_regressor, template_m)
+        rest = base + product(betas, self.joint_directions).reshape(-1, N_ROTATIONS, 3)
         bones = (rest[:, 1:] - rest[:, self.parents]).expand(len(wrist_m), -1, -1)
         rotations, positions = [rotmats[:, :1].expand(-1, 5, -1, -1)], [wrist_m[:, None].expand(-1, 5, -1)]
         for level in self.levels:
@@ -117,7 +128,7 @@ class _Skin(nn.Module):
         """World positions (batch, vertex, 3)."""
         n_batch = len(rotmats)
         moves = torch.cat((rotations, (positions[..., None] - rotations @ rest[..., None])), -1)
-        blended = moves.reshape(n_batch, N_ROTATIONS, 12).transpose(1, 2) @ self.weights
+        blended = product(moves.reshape(n_batch, N_ROTATIONS, 12).transpose(1, 2), self.weights)
         x, y, z, shift = blended.reshape(n_batch, 3, 4, -1).unbind(2)
         rest_vertices = self._rest_vertices(rotmats, betas, template_m)
         posed = x * rest_vertices[:, :1] + y * rest_vertices[:, 1:2] + z * rest_vertices[:, 2:] + shift
@@ -127,8 +138,8 @@ class _Skin(nn.Module):
         """(batch, 3, vertex) rest positions with shape and pose blend shapes."""
         identity = torch.eye(3, dtype=rotmats.dtype, device=rotmats.device)
         features = (rotmats[:, 1:] - identity).reshape(len(rotmats), -1)
-        shaped = (betas @ self.shape).reshape(-1, 3, len(self.vertices)) + self._template(template_m)
-        return (features @ self.pose).reshape(len(rotmats), 3, -1) + shaped
+        shaped = product(betas, self.shape).reshape(-1, 3, len(self.vertices)) + self._template(template_m)
+        return product(features, self.pose).reshape(len(rotmats), 3, -1) + shaped
 
     def _template(self, template_m: Tensor | None) -> Tensor:
         if template_m is None:

@@ -20,10 +20,10 @@ from hoidata.metrics.unmeasured import NO_GRAVITY, Unmeasured
 from hoidata.metrics.verb_ranges import SLIP, VerbRanges, up_in_object
 from hoidata.objects.rays import EITHER, first_hits
 from hoidata.objects.surface_index import PartSurface, SurfaceIndex, surface_index
+from hoidata.physics.realism import LARGEST_PENETRATION_M
 from hoidata.surface.contact import HandInObjectFrame, deepest_m, hand_in_object_frame
 
 GAP_M = 0.01  # between skin and surface: a larger gap is visible
-DEEP_M = 0.02  # a finger's thickness
 THROUGH_DEG = 120.0  # between the normals where a finger or palm enters and leaves: not over an edge
 TRAVEL_M = 0.02  # an object this far above its start is in the air; one that goes this far without a hand is seen to
 MIN_FRAMES = 3  # a tenth of a second; a shorter fault is not visible
@@ -173,12 +173,12 @@ def _does_not_pierce(
         deep = np.zeros(clip.n_frames, bool)
         if index.is_solid:
             depth_m = np.nan_to_num(deepest_m(hand, index))
-            deep = depth_m > DEEP_M
+            deep = depth_m > LARGEST_PENETRATION_M
             texts[-1] += f", {100 * depth_m.max():.1f} cm deep"
         frames = int((deep | through.any(axis=1)).sum())
         texts[-1] += f", too deep in {frames} frames"
         worst = max(worst, frames)
-    limit = f"a line through, or deeper than {100 * DEEP_M:.0f} cm, in at most {MIN_FRAMES - 1} frames"
+    limit = f"a line through, or deeper than {100 * LARGEST_PENETRATION_M:.1f} cm, in at most {MIN_FRAMES - 1} frames"
     without = "" if index.is_solid else "; depth is not measured, because the mesh encloses no solid"
     return Check("does not pierce", worst < MIN_FRAMES, f"{'; '.join(texts)} ({limit}){without}")
 

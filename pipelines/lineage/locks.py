@@ -54,7 +54,8 @@ def parse_locks(texts: Mapping[str, bytes]) -> dict[str, Locked]:
             stages = load_yaml(text)["stages"]
             locks |= {prefix + name: _locked(prefix + name, body) for name, body in stages.items()}
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise BadInput(file, "a lock file of DVC", type(error).__name__, "run `dvc repro`") from error
+            remedy = "if a run is just writing it, try again; else run `hoidata repro`"
+            raise BadInput(file, "a lock file of DVC", type(error).__name__, remedy) from error
     return locks
 
 

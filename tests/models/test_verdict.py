@@ -182,11 +182,11 @@ def test_a_floating_object_is_reported() -> None:
     assert failed(checks_of(lift())) == []
 
 
-def test_penetration_by_the_thickness_of_a_finger_is_reported() -> None:
-    shallow, deep = (checks_of(lift(depth))["does not pierce"] for depth in (0.015, 0.025))
+def test_penetration_deeper_than_manipnets_limit_is_reported() -> None:
+    shallow, deep = (checks_of(lift(depth))["does not pierce"] for depth in (0.012, 0.018))
     assert shallow.passed
     assert deep.passed is False
-    assert f"2.5 cm deep, too deep in {FRAMES} frames" in deep.words
+    assert f"1.8 cm deep, too deep in {FRAMES} frames (a line through, or deeper than 1.5 cm" in deep.words
 
 
 @pytest.mark.parametrize(

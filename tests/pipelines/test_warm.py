@@ -188,6 +188,35 @@ def test_a_warm_stage_and_its_workers_use_the_same_kernels(monkeypatch, tmp_path
     assert lines == [output_of(DOORS["stage"], {}).strip()] * 2
 
 
+# Raw files and clips of a small corpus; MKL is the matrix library of torch.
+CORPUS = """
+import hashlib, sys
+from pathlib import Path
+from hoidata.conversion.convert import convert_dataset
+from hoidata.datasets import get_adapter
+from hoidata.hands import load_embedded_hands
+from hoidata.synthetic.corpus import write_corpus
+folder = Path(sys.argv[1])
+write_corpus("h2o", folder / "raw", seed=0, size="small", jobs=1)
+convert_dataset(get_adapter("h2o"), folder / "raw", load_embedded_hands(), folder / "clips", progress=False)
+for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+    print(path.relative_to(folder), hashlib.sha256(path.read_bytes()).hexdigest())
+"""
+
+
+@needs_avx2
+@pytest.mark.slow
+def test_data_do_not_depend_on_the_matrix_kernels_of_torch(tmp_path: Path) -> None:
+    outputs = []
+    for kernels in ("AUTO", "COMPATIBLE"):
+        variables = {**os.environ, **portable_kernels(), "MKL_CBWR": kernels}
+        call = [sys.executable, "-c", CORPUS, str(tmp_path / kernels)]
+        done = subprocess.run(call, env=variables, capture_output=True, text=True, check=True)
+        outputs.append([line for line in done.stdout.splitlines() if line.startswith(("raw/", "clips/"))])
+    assert outputs[0]
+    assert outputs[0] == outputs[1]
+
+
 def test_kernels_are_not_set_without_avx2_or_on_another_system(monkeypatch, tmp_path: Path) -> None:
     (tmp_path / "cpuinfo").write_text("processor: 0\nflags\t\t: fpu sse sse4_2 avx\n")
     monkeypatch.setattr(processor, "_CPUINFO", tmp_path / "cpuinfo")
