@@ -47,7 +47,7 @@ CHECK_EVERY_ON_CPU, CHECK_EVERY = 1, 50
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Budget and optimiser (AdamW). The defaults are Text2HOI's, except for ``steps``."""
+    """Budget and optimiser (AdamW). Except for ``steps``, defaults are those of Text2HOI's code."""
 
     steps: int = 30_000
     batch: int = 64

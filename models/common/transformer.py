@@ -157,7 +157,7 @@ def sinusoid(positions: Tensor, width: int) -> Tensor:
     return torch.cat((angles.sin(), angles.cos()), -1)
 
 
-# Text2HOI encodes each agent as a frame position, far from the others: left, right, object.
+# Text2HOI's code encodes each agent as a frame position, far from the others: left, right, object.
 AGENT_POSITIONS = (1, 1666, 3333)
 
 

@@ -161,7 +161,7 @@ class DiffusionModel(nn.Module):
         return self.denoise(hands, objects, timesteps, self.encode_condition(condition))
 
     def encode_condition(self, condition: Condition) -> EncodedCondition:
-        """Encode what does not depend on the timestep (Text2HOI, Eq. 2)."""
+        """Encode what does not depend on the timestep (Text2HOI, Eq. 3)."""
         batch, token = condition.batch, self.text_in(condition.text)
         if self.verb_in is not None:
             token = token + self.verb_in(verb_one_hot(condition.verbs, self.config.verbs, token.device))
@@ -214,7 +214,7 @@ class DiffusionModel(nn.Module):
         return hands * self.signal_scale, objects * self.signal_scale
 
     def _layers(self, hands: Tensor, objects: Tensor, timesteps: Tensor, condition: EncodedCondition) -> Motion:
-        """Tokens (Text2HOI, Eq. 3), encoder, and linear layers per hand and object (Tables S8, S9)."""
+        """Tokens (Text2HOI, Sec. 3.2.3, Eq. 2), encoder, and linear layers per hand and object (Tables S8, S9)."""
         hands, objects = hands * condition.hand_mask[..., None], objects * condition.object_mask[..., None]
         hand_tokens = [to_tokens(hands[:, side], self.hand_points_per_token) for side in condition.sides]
         agents = [self.hands_in[side](tokens) for side, tokens in zip(condition.sides, hand_tokens, strict=True)]

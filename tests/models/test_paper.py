@@ -28,6 +28,7 @@ from models.common.features import Hands, Normaliser
 from models.common.predicting import PredictionConfig, requests_for, sample_family
 from models.common.sampling import SamplerConfig
 from models.common.training import TrainingSpec
+from models.common.transformer import agent_codes, sinusoid
 from models.registry import load_family, load_network
 from models.text2hoi import refiner_training
 from models.text2hoi.contact import AnchoredContact, ContactLossConfig, ContactModel
@@ -121,6 +122,13 @@ def test_estimated_maps_are_probabilities_in_training(
     torch.testing.assert_close(inputs[0][:, width : width + 1024], conditions[0].contact.amax(1))
 
 
+def test_the_denoiser_has_the_contact_networks_point_network_frozen(paper_trained: Path) -> None:
+    contact, diffusion = (load_checkpoint(paper_trained / n, load_network(n)).network for n in ("contact", "diffusion"))
+    assert isinstance(diffusion, DiffusionModel)
+    torch.testing.assert_close(diffusion.object_net.state_dict(), contact.object_net.state_dict())
+    assert not any(weight.requires_grad for weight in diffusion.object_net.parameters())
+
+
 def is_fractional(contact: Tensor) -> bool:
     return bool(((contact > 0.01) & (contact < 0.99)).float().mean() > 0.1)
 
@@ -186,7 +194,7 @@ def test_the_trained_refiner_was_given_the_contact_network(
 
 
 def test_training_draws_all_four_sentence_forms(annotated: AnnotatedStore, batch: ClipBatch) -> None:
-    forms = torch.arange(4.0)[:, None].expand(4, 512)
+    forms = torch.arange(1.0, 5.0)[:, None].expand(4, 512)  # 0: a dropped sentence, which the paper does not have
     clips = [replace(sample, text=forms.numpy()) for sample in HoiDataset(annotated, "train")]
     marked, forms_read = training_batch(clips), dict[str, Counter[float]]()
 
@@ -208,7 +216,7 @@ def test_training_draws_all_four_sentence_forms(annotated: AnnotatedStore, batch
         refiner._coarse_motions(clips, seeded(number))
     assert set(forms_read) == {"contact", "length", "diffusion", "refiner"}
     for counts in forms_read.values():
-        assert set(counts) == {0.0, 1.0, 2.0, 3.0}
+        assert set(counts) == {1.0, 2.0, 3.0, 4.0}
         assert min(counts.values()) > 20 * len(clips) / 4 / 3
 
 
@@ -237,6 +245,24 @@ def test_the_preset_has_no_settings_of_its_own_but_the_training(name: str, size:
     assert different <= size_fields
     if hasattr(network, "point_net"):
         assert network.point_net.centred is False
+
+
+@pytest.mark.parametrize(
+    ("name", "steps", "rate"),
+    [("contact", 28_000, 1e-3), ("length", 3_500, 1e-3), ("diffusion", 78_000, 1e-4), ("refiner", 10_500, 1e-4)],
+)
+def test_budgets_are_those_of_the_authors_code_for_arctic(name: str, steps: int, rate: float) -> None:
+    """The paper states none."""
+    training = spec(name).training
+    assert (training.steps, training.batch, training.learning_rate) == (steps, 64, rate)
+    assert (training.schedule, training.warmup, training.ema_decay, training.clip_norm) == ("constant", 0, 0, 0)
+
+
+def test_latents_are_normal_and_agents_have_the_positions_of_the_authors_code() -> None:
+    latents = ContactModel(CONTACT).draw_latents(50, 50, seeded())
+    assert spec("contact").network.latent == 64
+    assert (float(latents.mean()), float(latents.std())) == pytest.approx((0, 1), abs=0.02)
+    assert torch.equal(agent_codes(512, CPU), sinusoid(torch.tensor([1, 1666, 3333]), 512))
 
 
 # --- hand type
