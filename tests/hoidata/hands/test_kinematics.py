@@ -144,3 +144,15 @@ def test_long_tracks_give_the_joints_of_single_frames():
         one = HandTrack(*(getattr(track, name)[frame : frame + 1] for name in
                           ("wrist_m", "global_orient", "hand_pose", "betas", "valid")))  # fmt: skip
         np.testing.assert_allclose(track_joints(one, model)[0], joints[frame], atol=1e-7)
+
+
+def test_without_gradients_the_same_vertices_come_from_numpy():
+    layer, inputs = HandKinematics(load_embedded_hands().left, torch.float64), torch_inputs(random_hand(3))
+    inputs = [array.requires_grad_() for array in inputs]
+    expected = layer(*inputs)
+    with torch.no_grad():
+        got = layer(*inputs)
+    assert expected[0].requires_grad
+    assert not got[0].requires_grad
+    for a, b in zip(expected, got, strict=True):
+        torch.testing.assert_close(b, a.detach(), atol=1e-12, rtol=0)
