@@ -9,8 +9,9 @@ HOIDATA_BENCH_WINDOWS=1 measures windows of whole test clips as BimArt's release
 converted with ``clips: whole`` and the split ``bimart-released``. Networks, motions and metrics are stored in
 HOIDATA_BENCH_OUT (.hoidata/bimart-tables): a killed run continues. Delete the folder after a change of code or data.
 
-The nearest training window, refined as ours, is the retrieval baseline. Only CAMS-B is conditioned on recorded hands:
-those of the first frame, and when each hand touches which part.
+The nearest training window, refined as ours, is the retrieval baseline. Every method is given which hands act in the
+recording. Only CAMS-B is also conditioned on recorded hands: those of the first frame, and when each hand touches
+which part.
 """
 
 import os

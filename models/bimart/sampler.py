@@ -79,7 +79,7 @@ def paper_step(keypoints_m: Tensor, target: ContactTarget, scale: Tensor, window
     Args:
         keypoints_m: (B, F, 2, J, 3).
         scale: (2, J, 3) metres per normalised unit.
-        window_frames: frames of a window; a longer motion gets a longer step.
+        window_frames: frames of a window; windows follow each other without overlap.
 
     Returns:
         (B, F, 2, J, 3) in normalised units.
@@ -88,9 +88,9 @@ def paper_step(keypoints_m: Tensor, target: ContactTarget, scale: Tensor, window
     count = target.mask.unflatten(-1, (2, -1)).sum((1, 3), keepdim=True).clamp_min(1)
     by_point = 2 * current.error_m[..., None] * current.direction / count[..., None]
     gradient = _sum_at_keypoints(by_point, current.nearest, keypoints_m) * scale
-    length = gradient.flatten(1).norm(dim=1).clamp_min(1e-12)
-    windows = max(keypoints_m.shape[1] / window_frames, 1.0) ** 0.5
-    return -gradient * (windows / length)[:, None, None, None, None]
+    windows = gradient.split(window_frames, 1)
+    lengths = [torch.linalg.vector_norm(window, dim=(1, 2, 3, 4), keepdim=True).clamp_min(1e-12) for window in windows]
+    return torch.cat([-window / length for window, length in zip(windows, lengths, strict=True)], 1)
 
 
 def metre_step(keypoints_m: Tensor, target: ContactTarget) -> Tensor:

@@ -1,15 +1,21 @@
 """BimArt's comparison in bench/: every method is trained and measured; CAMS-B's stages and hands."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
 from bench import bimart_tables
 from bench.bimart_baselines import (
     BASIS,
+    MDM,
+    OMOMO,
     CanonicalClip,
+    PoseConfig,
     Stage,
     carried_keypoints,
     fixed_contact_joints,
@@ -17,6 +23,7 @@ from bench.bimart_baselines import (
     targets,
 )
 from bench.bimart_tables import METHODS, TABLES, Run
+from hoidata.batches.dataset import ClipSample
 from hoidata.hands import load_embedded_hands
 from hoidata.metrics.optional_metrics import select_metrics
 from hoidata.objects.model import articulate
@@ -72,6 +79,14 @@ def test_every_metric_of_bimart_is_in_the_tables_as_released_and_corrected() -> 
     metrics = [metric.name for metric in select_metrics(["bimart"]) if metric.name.startswith("bimart_")]
     assert set(metrics) - {"bimart_con_everywhere_corrected"} <= set(names)
     assert len(names) == len(set(names))
+
+
+def test_omomo_b_has_an_l1_loss_and_mdm_b_a_squared_one(samples: list[ClipSample]) -> None:
+    train = SimpleNamespace(ids=[samples[0].clip_id], whole=lambda _: samples[0])
+    corpus = SimpleNamespace(train=train, held_out=[])
+    setup: Any = SimpleNamespace(corpus=corpus, network=PoseConfig(), device=torch.device("cpu"))
+    objectives: list[Any] = [network.objective(setup)[0] for network in (MDM, *OMOMO)]
+    assert [float(objective.error(torch.tensor(-3.0))) for objective in objectives] == [9, 3, 3]
 
 
 def lid_points_m(scene: Scene) -> np.ndarray:

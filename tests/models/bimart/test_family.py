@@ -15,7 +15,7 @@ from hoidata.hands import load_embedded_hands
 from hoidata.sensors.keypoints import hand_keypoints
 from hoidata.sensors.part_bps import BasisSettings, distance_map
 from hoidata.store.annotated import AnnotatedStore
-from models.bimart.family import BIMART, OTHER_OBJECT, OTHER_PATH, UNREFINED, ZERO_MAP, BimArtSampler
+from models.bimart.family import BIMART, OTHER_OBJECT, OTHER_PATH, UNREFINED, ZERO_MAP, BimArtSampler, mean_maps
 from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel
 from models.bimart.retrieval import NEAREST_REFINED, NEAREST_WINDOW, OBJECT_MEAN_POSE
 from models.bimart.sampler import BimArt, SamplingTask
@@ -219,6 +219,24 @@ def test_diagnosed_metrics_are_positive_and_the_best_of_ten_maps_is_no_worse_tha
     assert set(metrics) == {"bimart-contact", "bimart-motion"}
     assert all(np.isfinite(value) and value > 0 for by_name in metrics.values() for value in by_name.values())
     assert metrics["bimart-contact"]["best_of_10_mm"] <= metrics["bimart-contact"]["map_error_mm"]
+
+
+def test_mean_maps_are_means_over_tracked_frames_of_acting_hands_by_object(samples: list[ClipSample]) -> None:
+    features = FeatureConfig(BasisSettings(4), keypoints=20)
+    valid = samples[0].valid.copy()
+    valid[:, 3:] = False
+    clips = [replace(samples[0], valid=valid), *samples]
+    means = mean_maps(clips, HANDS, features)
+    assert set(means) == {"", *(clip.object_model.name for clip in clips)}
+    for name, mean in means.items():
+        for side in range(2):
+            frames = [
+                recorded_clip(clip, HANDS, features).contact_m[side][clip.valid[side]].astype(np.float64)
+                for clip in clips
+                if name in ("", clip.object_model.name) and clip.active_hands[side]
+            ]
+            expected = np.concatenate(frames).mean(axis=0) if frames else np.zeros(8)
+            np.testing.assert_allclose(mean[side], expected)
 
 
 def test_retrieval_baselines_place_training_hands_at_the_object(sources: Sources, annotated: AnnotatedStore) -> None:

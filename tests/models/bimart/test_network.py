@@ -10,7 +10,7 @@ import torch
 from hoidata.sensors.part_bps import BasisSettings
 from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel, Windows, contact_channels
 from models.bimart.scene import FeatureConfig, RecordedClip, Scene, split_motion
-from models.bimart.training import Moments
+from models.bimart.training import LossConfig, Moments, Targets, window_losses
 from models.common.transformer import TransformerConfig
 
 FEATURES = FeatureConfig(BasisSettings(3), keypoints=4, window_frames=8, state="local")
@@ -178,3 +178,21 @@ def test_a_motion_is_keypoints_left_and_right_then_vectors_to_the_object_left_an
         np.testing.assert_array_equal(restored, array)
     left = features.spread_over_motion(torch.tensor([True, False])).numpy()
     np.testing.assert_array_equal(rows[1][left], np.concatenate((expected[0], expected[2])))
+
+
+class ZeroModel(MotionModel):
+    """Predicts zeros, so that the error is the clean motion."""
+
+    def forward(self, x: torch.Tensor, steps: torch.Tensor, windows: Windows, drop: torch.Tensor | None = None):
+        return torch.zeros_like(x)
+
+
+def test_the_velocity_loss_is_the_error_of_differences_between_frames() -> None:
+    network, windows = ZeroModel(TINY), random_windows([6, 6], 6)
+    clean, mask = torch.randn(2, 6, len(network.mean)), torch.rand(2, 6, len(network.mean)) < 0.8
+    target = Targets(windows, clean, mask, contact_channels(windows))
+    losses = window_losses(network, target, LossConfig(velocity_weight=2.0), torch.Generator().manual_seed(0))
+    both_known = (mask[:, 1:] & mask[:, :-1]).numpy()
+    velocity = np.diff(clean.numpy(), axis=1)[both_known] ** 2
+    assert losses["velocity"].item() == pytest.approx(velocity.mean(), rel=1e-5)
+    assert losses["total"].item() == pytest.approx((clean[mask] ** 2).mean().item() + 2 * velocity.mean(), rel=1e-5)

@@ -103,6 +103,18 @@ def test_the_papers_step_is_the_normalised_negative_gradient_of_the_mean_squared
         torch.testing.assert_close(step[row], down.float(), rtol=1e-4, atol=1e-6)
 
 
+def test_the_papers_step_has_length_1_in_each_window_of_a_longer_motion() -> None:
+    keypoints, target = target_map()
+    target = replace(target, mask=target.mask[:, :1].expand(-1, 3, -1))  # equal weights of both hands in all frames
+    scale = torch.rand(2, 5, 3) + 0.5
+    step = paper_step(keypoints, target, scale, window_frames=2)
+    for frames in (slice(0, 2), slice(2, 3)):
+        window = ContactTarget(*(tensor[:, frames] for tensor in vars(target).values()))
+        alone = paper_step(keypoints[:, frames], window, scale, window_frames=2)
+        torch.testing.assert_close(step[:, frames], alone)
+        torch.testing.assert_close(alone.flatten(1).norm(dim=1), torch.ones(2))
+
+
 def test_a_step_in_metres_moves_keypoints_towards_the_target_and_keeps_those_that_match() -> None:
     points_m = torch.tensor([[0.0, 0, 0]]).expand(1, 1, 1, 3)
     keypoints = torch.tensor([[[0.05, 0, 0], [0.0, 0.3, 0]]]).expand(1, 1, 2, 2, 3)

@@ -179,6 +179,8 @@ def test_the_rule_of_post_processing_is_that_of_the_preset(definition: Literal["
     chosen: tuple[Rule, ...] = ("preset", rule)
     for number, name in enumerate(chosen):
         rollout = HandRollout(Predictor(network, name), hand, SurfaceIndex(box), hand.rest_rotmats)
+        # Sec. 6.4: predicted distances are clamped to be non-negative.
+        output[-hand.n_points :] = -number
         rollout.advance(output, FrameContext(np.zeros(336), placed, None))
         answers[number] = rollout.answer
         # Sec. 6.4: the post-processed pose is the next input.
