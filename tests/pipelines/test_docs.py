@@ -165,5 +165,5 @@ def test_a_cell_of_results_has_interval_and_measured_clips_and_the_best_is_bold(
 
 
 def test_an_unknown_name_of_results_is_refused(tmp_path):
-    with pytest.raises(BadInput, match="one of arctic, arctic-hands, embedded-arctic"):
+    with pytest.raises(BadInput, match="one of arctic, arctic-hands, arctic-windows, embedded-arctic"):
         results.collect("artic", tmp_path)
