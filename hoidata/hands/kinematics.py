@@ -6,7 +6,6 @@ World convention of hoidata: joint 0 is at ``wrist_m``, and the hand rotates abo
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 

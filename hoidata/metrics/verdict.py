@@ -27,7 +27,6 @@ GAP_M = 0.01  # between skin and surface: a larger gap is visible
 THROUGH_DEG = 120.0  # between the normals where a finger or palm enters and leaves: not over an edge
 TRAVEL_M = 0.02  # an object this far above its start is in the air; one that goes this far without a hand is seen to
 MIN_FRAMES = 3  # a tenth of a second; a shorter fault is not visible
-SINK_M = 0.01  # below where the object stood: visible at its edge
 STILL_M = 0.01  # an object of which no point moves farther does not move
 TILT_DEG = 20.0  # an object that leans more does not stand upright
 ALIKE = 0.03  # of the size: an object is the same shape in two rotations if its surfaces differ by less
@@ -239,7 +238,7 @@ def _stands_upright(clip: Clip, up: np.ndarray | Unmeasured) -> Check:
 
 
 def _does_not_sink(clip: Clip, gap_m: Mapping[Side, np.ndarray]) -> Check:
-    """An object that no hand holds in the first frame stands on something, which it must not go into."""
+    """An object that no hand holds at first stands on something, which it enters no deeper than hands may enter it."""
     name = "does not sink"
     if clip.gravity is None:
         return Check(name, None, NO_GRAVITY.reason)
@@ -247,9 +246,10 @@ def _does_not_sink(clip: Clip, gap_m: Mapping[Side, np.ndarray]) -> Check:
         return Check(name, None, "a hand is at the object in the first frame, so it need not stand on anything")
     lowest_m = (_vertex_paths_m(clip) @ -np.asarray(clip.gravity, np.float64)).min(axis=1)
     below_m = lowest_m[0] - lowest_m
-    frames = int((below_m > SINK_M).sum())
-    words = f"{100 * below_m.max():.1f} cm below where it stood at most, deeper than {100 * SINK_M:.0f} cm in {frames}"
-    return Check(name, frames < MIN_FRAMES, f"{words} frames (at most {MIN_FRAMES - 1})")
+    frames = int((below_m > LARGEST_PENETRATION_M).sum())
+    words = f"{100 * below_m.max():.1f} cm below where it stood at most, deeper than "
+    words += f"{100 * LARGEST_PENETRATION_M:.1f} cm in {frames} frames (at most {MIN_FRAMES - 1})"
+    return Check(name, frames < MIN_FRAMES, words)
 
 
 def _looks_alike(clip: Clip, up: np.ndarray, actual: np.ndarray) -> bool:

@@ -221,7 +221,7 @@ def test_an_object_on_its_side_does_not_stand_upright(axis: str, degrees: float,
     assert checks_of(clip, up=Z)["stands upright"].passed is upright
 
 
-@pytest.mark.parametrize(("below_m", "frames", "sinks"), [(0.009, 10, False), (0.012, 10, True), (0.012, 2, False)])
+@pytest.mark.parametrize(("below_m", "frames", "sinks"), [(0.014, 10, False), (0.017, 10, True), (0.017, 2, False)])
 def test_an_object_that_goes_into_what_it_stood_on_sinks(below_m: float, frames: int, sinks: bool) -> None:
     path_m = np.zeros((FRAMES, 3), np.float32)
     path_m[5 : 5 + frames, 2] = -below_m
