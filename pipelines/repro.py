@@ -56,7 +56,7 @@ def steps_growth(root: Path, names: Iterable[str]) -> dict[str, float]:
     graph, locks, values = written_graph(root), read_locks(root), read_file(root / "params.yaml")
     growth = {}
     for name in (name for name in names if name in graph and name in locks):
-        now = _steps({key: look_up(values, key) for key in graph[name].params})
+        now = _steps({key: look_up(values, key) for key in graph[name].params if key.startswith("train.")})
         before = _steps(locks[name].params)
         growth |= {name: now / before} if now and before else {}
     return growth

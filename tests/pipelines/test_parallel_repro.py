@@ -133,7 +133,7 @@ stages:
   train:
     matrix: {{net: [a, b]}}
     cmd: train ${{item.net}}
-    params: [train.seed, "train.ours.${{item.net}}", "train.{size}.${{item.net}}"]
+    params: [train.seed, "train.ours.${{item.net}}", "train.{size}.${{item.net}}", other.yaml]
 """
 
 
