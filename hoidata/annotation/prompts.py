@@ -201,7 +201,7 @@ def read_sentence(text: str) -> tuple[str | None, str | None]:
     return reading.verb, reading.object_words
 
 
-def further_verbs(text: str, made: str | None, vocabulary: Vocabulary) -> list[str]:
+def further_verbs(text: str, generated: str | None, vocabulary: Vocabulary) -> list[str]:
     """Training verbs in a sentence in addition to the generated one, such as "pour" in "Lift a mug and pour"."""
     clauses = [re.findall(r"[a-z-]+", clause) for clause in _BETWEEN_CLAUSES.split(text.lower())]
     clauses = [rest for words in clauses if (rest := words[_count_adverbs(words) :])]
@@ -211,7 +211,7 @@ def further_verbs(text: str, made: str | None, vocabulary: Vocabulary) -> list[s
     for number, words in enumerate(clauses):
         starts = range(1) if ordered or number else _of_no_article(words)
         begun = (verb for start in starts for verb in verbs if _begins_with(words[start:], verb, vocabulary, ordered))
-        matches += [verb for verb in (next(begun, None),) if verb and verb != made]
+        matches += [verb for verb in (next(begun, None),) if verb and verb != generated]
     return list(dict.fromkeys(matches))
 
 

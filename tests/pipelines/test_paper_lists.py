@@ -13,18 +13,18 @@ HEADER = ["item", "statement", "status", "where", "test", "reason"]
 def test_statements_have_a_status_and_existing_code_and_tests(path):
     with path.open(encoding="utf-8", newline="") as file:
         statements = list(csv.DictReader(file, strict=True))
-    assert len({row["item"] for row in statements}) == len(statements) > 0
-    for row in statements:
-        assert list(row) == HEADER
-        assert None not in row.values(), row
-        assert row["statement"], row
-        assert row["status"] in ("exact", "differs", "missing"), row
-        assert bool(row["reason"]) == (row["status"] != "exact"), row
-        assert row["where"] or row["status"] == "missing", row
-        code, _, name = row["where"].partition(":")
-        assert not row["where"] or (name and name in text_of(code)), row
-        test, *_, name = row["test"].split("::") if row["test"] else ("", "")
-        assert not row["test"] or f"def {name}(" in text_of(test), row
+    assert len({one["item"] for one in statements}) == len(statements) > 0
+    for statement in statements:
+        assert list(statement) == HEADER
+        assert None not in statement.values(), statement
+        assert statement["statement"], statement
+        assert statement["status"] in ("exact", "differs", "missing"), statement
+        assert bool(statement["reason"]) == (statement["status"] != "exact"), statement
+        assert statement["where"] or statement["status"] == "missing", statement
+        code, _, name = statement["where"].partition(":")
+        assert not statement["where"] or (name and name in text_of(code)), statement
+        test, *_, name = statement["test"].split("::") if statement["test"] else ("", "")
+        assert not statement["test"] or f"def {name}(" in text_of(test), statement
 
 
 def text_of(path: str) -> str:
