@@ -13,7 +13,7 @@ from hoidata.metrics.pair import Pair
 from hoidata.metrics.touch import contact_entries
 from hoidata.metrics.unmeasured import NO_GRAVITY, Unmeasured, Values
 from hoidata.physics.mano_capsules import world_rotmats
-from hoidata.physics.realism import VARIANTS, Realism, has_acceleration, score, smoothness_m_s2
+from hoidata.physics.realism import VARIANTS, Realism, every_frame_passes, has_acceleration, score, smoothness_m_s2
 from hoidata.physics.scene import Scene
 
 NO_VERB = Unmeasured("the clip has no verb")
@@ -132,6 +132,22 @@ def floor_as_released(pair: Pair, frame_step: int) -> Values:
     return _floor(pair, "as released", frame_step)
 
 
+def realism_every_frame(pair: Pair, frame_step: int) -> Values:
+    """(frame,) 1 where contact forces of hands and table explain the object's motion and no hand is deep inside it."""
+    return _passes(pair.scene, frame_step)
+
+
+def floor_every_frame(pair: Pair, frame_step: int) -> Values:
+    """(frame,) as ``realism_every_frame`` without hands: 1 where the object rests on the table or falls."""
+    return _passes(_without_hands(pair), frame_step)
+
+
+def _passes(scene: Scene | Unmeasured, frame_step: int) -> Values:
+    if isinstance(scene, Unmeasured):
+        return scene
+    return every_frame_passes(scene, _every_nth(np.ones(scene.n_frames, bool), frame_step)).astype(np.float64)
+
+
 def capsule_depth_mm(pair: Pair, frame_step: int) -> Values:
     """(1,) mean depth over the hand capsules that overlap the object in lifted frames, millimetres."""
     realism = _realism(pair, "SI", frame_step)
@@ -170,8 +186,8 @@ def _realism(pair: Pair, variant: str, frame_step: int) -> Realism | Unmeasured:
     return score(scene, VARIANTS[variant], _every_nth(scene.lifted, frame_step))
 
 
-def _every_nth(lifted: np.ndarray, frame_step: int) -> np.ndarray:
-    """Every n-th lifted frame, as (frame,) bool. Derivatives use all frames; only the scored frames are thinned."""
-    chosen = np.zeros_like(lifted)
-    chosen[np.flatnonzero(lifted)[::frame_step]] = True
+def _every_nth(frames: np.ndarray, frame_step: int) -> np.ndarray:
+    """Every n-th of frames (frame,) bool. Derivatives use all frames; only the scored frames are thinned."""
+    chosen = np.zeros_like(frames)
+    chosen[np.flatnonzero(frames)[::frame_step]] = True
     return chosen

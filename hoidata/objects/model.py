@@ -104,6 +104,10 @@ class ObjectModel:
         moving_m = self.vertices_m[self.part == 1]
         return float(np.linalg.norm(moving_m - moving_m.mean(axis=0), axis=1).max())
 
+    def vertices_of(self, part: int) -> np.ndarray:
+        """(vertex, 3) vertices of one part, hinge angle 0."""
+        return self.vertices_m[self.part == part] if self.is_articulated else self.vertices_m
+
     def faces_of(self, part: int) -> np.ndarray:
         """(face, 3) faces of one part."""
         return self.faces[self.face_part == part] if self.is_articulated else self.faces
@@ -178,7 +182,7 @@ class ObjectModel:
         lowest = []
         for part in self.parts:
             world_from_part = world_from_object @ self.object_from_part(part, hinge_rad)
-            vertices_m = self.vertices_m[self.part == part] if self.is_articulated else self.vertices_m
+            vertices_m = self.vertices_of(part)
             # height = up @ (R v + t) = (up @ R) @ v + up @ t: no vertex is transformed to the world.
             up_in_part, origins_m = up @ world_from_part.rotation, world_from_part.translation @ up
             starts = range(0, len(up_in_part), _CHUNK_FRAMES)

@@ -1,7 +1,7 @@
 """Physical realism, penetration and smoothness of hand-object motion (ManipNet, Zhang et al. 2021, Sec. 8).
 
-Scored frames are lifted and have no capsule 1.5 cm or more inside the object. There are two variants: SI units, and the
-units of ManipNet's release.
+``score`` takes lifted frames without a capsule 1.5 cm or more inside the object. There are two variants: SI units, and
+the units of ManipNet's release. ``every_frame_passes`` takes all frames, and the table carries an object on it.
 """
 
 from collections.abc import Mapping
@@ -20,6 +20,8 @@ from hoidata.physics.scene import Scene
 LARGEST_PENETRATION_M = 0.015
 SMOOTHNESS_FPS = 60.0
 MAX_STEPS = 300
+TABLE_CONTACT_M = 0.005  # vertices of a resting object this far above its lowest one touch the table
+_TABLE_CORNERS = 8  # contacts with the table: the outermost vertices in as many horizontal directions
 RELEASED_UNITS_PER_METRE = 10.0
 RELEASED_GRAVITY_PER_S = 9.8
 RELEASED_STEPS = 100
@@ -36,7 +38,7 @@ class StandardUnits:
     limit: ClassVar[float] = RESIDUAL_LIMIT  # of the residual's norm, N and N m
     at_centre: ClassVar[bool] = False
 
-    def residuals(self, scene: Scene, contacts: CapsuleContacts) -> np.ndarray:
+    def residuals(self, scene: Scene, contacts: "CapsuleContacts | TableContacts") -> np.ndarray:
         """(frame,) norm of the residual wrench after the best contact forces."""
         arms = contacts.point_m - scene.motion.centre_m[contacts.frame]
         columns, offsets = force_columns(contacts.frame, arms, cone_edges(contacts.normal, FRICTION), scene.n_frames)
@@ -192,6 +194,44 @@ def score(scene: Scene, variant: Variant, frames: np.ndarray | None = None) -> R
         penetration_m=penetration,
         colliding_m=mean_depth,
     )
+
+
+class TableContacts(NamedTuple):
+    """Contacts in the world frame of an object on the table."""
+
+    frame: np.ndarray  # (contact,) int
+    point_m: np.ndarray  # (contact, 3)
+    normal: np.ndarray  # (contact, 3) unit, outward of the object
+
+
+def every_frame_passes(scene: Scene, frames: np.ndarray) -> np.ndarray:
+    """(selected frame,) bool: contact forces of hands and table explain the motion, and no capsule is 1.5 cm inside.
+
+    The table pushes in frames in which the object is not lifted. SI units; frames (frame,) bool.
+    """
+    hands, table = contacts_in(scene, frames), table_contacts(scene, np.flatnonzero(frames & ~scene.lifted))
+    columns = zip((hands.frame, hands.point_m, hands.normal), table, strict=True)
+    contacts = TableContacts(*(np.concatenate(column) for column in columns))
+    passed = StandardUnits().residuals(scene, contacts) < StandardUnits.limit
+    passed[hands.frame[hands.depth_m >= LARGEST_PENETRATION_M]] = False
+    return passed[frames]
+
+
+def table_contacts(scene: Scene, frames: np.ndarray) -> TableContacts:
+    """Contacts with the table in frames (frame,) int: the outermost of the object's lowest vertices."""
+    model, poses = scene.model, scene.poses.taken(frames)
+    side, other = np.linalg.svd(scene.gravity[None])[2][1:]
+    angles = 2 * np.pi * np.arange(_TABLE_CORNERS) / _TABLE_CORNERS
+    directions = np.outer(np.cos(angles), side) + np.outer(np.sin(angles), other)
+    parts = [(poses.world_from_part(model, part), model.vertices_of(part)) for part in model.parts]
+    points = []
+    for index, lowest_m in enumerate(scene.lowest_m[frames]):
+        vertices = np.concatenate([world_from_part[[index]] @ rows[None] for world_from_part, rows in parts], axis=1)[0]
+        touching = vertices[-vertices @ scene.gravity <= lowest_m + TABLE_CONTACT_M]
+        points.append(touching[np.unique((touching @ directions.T).argmax(axis=0))])
+    counts = [len(rows) for rows in points]
+    point = np.concatenate([np.zeros((0, 3)), *points])
+    return TableContacts(np.repeat(frames, counts), point, np.broadcast_to(scene.gravity, point.shape))
 
 
 def contacts_in(scene: Scene, frames: np.ndarray) -> CapsuleContacts:

@@ -253,9 +253,12 @@ def test_every_registered_metric_measures_what_its_name_says(make_clip, pair_of)
     on_hand, slow = on_a_hand(make_clip), on_a_hand(make_clip, 0.98, 0.5)
     carried = figures(pair_of(on_hand, on_hand, table_m=-1.0))
     alone = {name: value for name, value in figures(pair_of(slow, on_hand, table_m=-1.0)).items() if "realism" in name}
-    assert (carried["realism_si"], carried["realism_released"]) == (1, 1)
-    assert (carried["realism_si_floor"], carried["realism_released_floor"]) == (0, 0)
+    assert (carried["realism_si"], carried["realism_released"], carried["realism_every_frame"]) == (1, 1, 1)
+    floors = ("realism_si_floor", "realism_released_floor", "realism_every_frame_floor")
+    assert [carried[name] for name in floors] == [0, 0, 0]
     assert alone == {
+        "realism_every_frame": 0,
+        "realism_every_frame_floor": 0,
         "realism_si": 0,
         "realism_si_floor": 0,
         "realism_released": 1,
@@ -278,6 +281,16 @@ def test_realism_is_scored_only_above_the_table_of_the_recording(make_clip, pair
     assert len(motion.realism_si(pair_of(carried, carried, table_m=-BOTTOM_M - 0.02), 1)) == 12
     assert len(motion.realism_si(pair_of(carried, carried, table_m=-BOTTOM_M - 0.02), 3)) == 4
     assert motion.realism_si(pair_of(carried, carried, table_m=None), 1) == NO_GRAVITY
+
+
+def test_every_frame_is_scored_and_the_table_carries_what_rests_on_it(make_clip, pair_of):
+    alone, carried = on_a_hand(make_clip, hand_below_m=0.5), on_a_hand(make_clip)
+    for table_m, passes in ((-BOTTOM_M, 1.0), (-BOTTOM_M - 0.02, 0.0)):
+        pair = pair_of(alone, carried, table_m=table_m)
+        assert motion.realism_every_frame(pair, 3).tolist() == [passes] * 4
+        assert motion.floor_every_frame(pair_of(carried, carried, table_m=table_m), 3).tolist() == [passes] * 4
+    assert motion.realism_every_frame(pair_of(carried, alone, table_m=-BOTTOM_M - 0.02), 1).all()
+    assert motion.realism_every_frame(pair_of(carried, carried, table_m=None), 1) == NO_GRAVITY
 
 
 def test_capsule_depth_is_how_far_capsules_reach_over_a_plane(make_clip, pair_of):

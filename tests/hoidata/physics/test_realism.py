@@ -14,9 +14,11 @@ from hoidata.physics.contact_forces import cone_edges
 from hoidata.physics.realism import (
     AsReleased,
     StandardUnits,
+    every_frame_passes,
     friction_edges,
     score,
     smoothness_m_s2,
+    table_contacts,
 )
 from hoidata.physics.scene import Scene, clip_scene
 from tests.builders.objects import box_model, two_parts
@@ -122,6 +124,65 @@ def test_frames_with_a_capsule_too_deep_are_not_scored():
     np.testing.assert_allclose(result.penetration_m[5:8], 0.021, atol=1e-6)
     np.testing.assert_allclose(result.penetration_m[8:], 0.001, atol=1e-6)
     assert result.colliding_m == pytest.approx((17 * 4 * 0.001 + 3 * 2 * 0.021) / (17 * 4 + 3 * 2), abs=1e-6)
+
+
+ALL = np.ones(20, bool)
+ON_TABLE = np.tile([0.0, 0.0, SIZE[2] / 2], (20, 1))
+
+
+def _pushed(acceleration_m_s2: float) -> np.ndarray:
+    """A box that slides on the table along x."""
+    return ON_TABLE + 0.5 * acceleration_m_s2 * _times() ** 2 * [1, 0, 0]
+
+
+def test_the_table_carries_what_rests_on_it_and_nothing_that_is_lifted():
+    assert every_frame_passes(_scene(ON_TABLE), ALL).all()
+    lifted = ON_TABLE + np.array([0, 0, 0.016])
+    assert not every_frame_passes(_scene(lifted), ALL).any()
+    assert every_frame_passes(_scene(lifted, hands=_pinch(lifted)), ALL).all()
+
+
+def test_the_table_pushes_only_up_and_within_its_friction_cone():
+    assert every_frame_passes(_scene(_pushed(0.3 * 9.81)), ALL).all()  # friction .35
+    fast = _pushed(0.6 * 9.81)
+    assert not every_frame_passes(_scene(fast), ALL).any()
+    assert every_frame_passes(_scene(fast, hands=_pinch(fast, sides=(-1,))), ALL).all()  # a finger pushes along +x
+    assert not every_frame_passes(_scene(fast, hands=_pinch(fast, sides=(1,))), ALL).any()  # from the other side
+    pulled_down = ON_TABLE - 0.5 * 15 * (_times() - _times().mean()) ** 2 * [0, 0, 1]
+    assert not every_frame_passes(_scene(pulled_down, table_m=0.0), ALL).any()
+
+
+def test_a_box_on_its_edge_needs_a_hand():
+    on_edge = np.tile(rotvec_to_rotmat(np.array([0.0, 0.5, 0.0])), (20, 1, 1))
+    corners = BOX.vertices_m @ on_edge[0].T
+    centre = np.tile([0.0, 0.0, -corners[:, 2].min()], (20, 1))
+    assert not every_frame_passes(_scene(centre, on_edge), ALL).any()
+    assert every_frame_passes(_scene(centre, on_edge, _pinch(centre, on_edge)), ALL).all()
+
+
+def test_a_frame_with_a_capsule_too_deep_does_not_pass():
+    shift = np.zeros((20, 3))
+    shift[5:8, 0] = 0.02  # one finger 21 mm into the box
+    passed = every_frame_passes(_scene(ON_TABLE, hands=_pinch(ON_TABLE).moved(shift)), ALL)
+    assert np.flatnonzero(~passed).tolist() == [5, 6, 7]
+
+
+def test_only_the_chosen_frames_are_scored():
+    path = ON_TABLE.copy()
+    path[10:, 2] += 0.05
+    chosen = np.arange(20) % 3 == 0
+    passed = every_frame_passes(_scene(path), chosen)
+    np.testing.assert_array_equal(passed, every_frame_passes(_scene(path), ALL)[chosen])
+    assert passed.any()
+    assert not passed.all()
+
+
+def test_a_box_touches_the_table_with_the_corners_of_its_lower_face():
+    contacts = table_contacts(_scene(ON_TABLE), np.array([2, 7]))
+    assert contacts.frame.tolist() == [2] * 4 + [7] * 4
+    corners = {(x, y, 0.0) for x in (-0.05, 0.05) for y in (-0.04, 0.04)}
+    assert {tuple(np.round(point, 6) + 0.0) for point in contacts.point_m[:4]} == corners
+    np.testing.assert_array_equal(contacts.normal, np.tile(DOWN, (8, 1)))
 
 
 def _by_scipy(wrench: np.ndarray, edges: np.ndarray, arms: np.ndarray) -> float:
