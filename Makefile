@@ -30,7 +30,7 @@ $(VENV)/.installed-dev: pyproject.toml constraints.txt
 
 # The documentation as a site in build/site; strict: no dead link, nothing left out.
 docs: install-dev
-	NO_MKDOCS_2_WARNING=1 mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 python -m mkdocs build --strict --quiet
 
 # Three processes: with two, cores wait for servers and killed processes.
 test: install-dev

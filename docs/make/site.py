@@ -1,4 +1,4 @@
-"""MkDocs hook that adds Markdown files from outside of docs to the site, and rewrites links to them."""
+"""MkDocs hook that adds pages made from the code and Markdown files outside of docs, and rewrites links to them."""
 
 import os
 import posixpath
@@ -6,6 +6,8 @@ import re
 from pathlib import Path
 
 from mkdocs.structure.files import File
+
+from docs.make import reference
 
 ROOT = Path(__file__).parents[2]
 PAGES = {
@@ -25,6 +27,8 @@ def on_files(files, config):
     """Add the pages to the files of the site."""
     for source, target in PAGES.items():
         files.append(File.generated(config, target, content=(ROOT / source).read_text(encoding="utf-8")))
+    for target, text in reference.PAGES.items():
+        files.append(File.generated(config, target, content=text()))
     return files
 
 
