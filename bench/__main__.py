@@ -8,7 +8,7 @@ Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder with the e
 
 import sys
 
-from bench import adapters, bimart, bimart_tables, kernels, paper_tables, recordings, samplers, scale, soak
+from bench import adapters, bimart, bimart_tables, kernels, paper_tables, recordings, samplers, scale, soak, speed
 
 BENCHMARKS = {
     "adapters": adapters.main,
@@ -19,8 +19,9 @@ BENCHMARKS = {
     "bimart-tables": bimart_tables.main,
     "recordings": recordings.main,
     "soak": soak.main,
+    "speed": speed.main,
 }
-ON_REQUEST = ("bimart-tables", "recordings", "soak")  # they need data or a network, and run for hours
+ON_REQUEST = ("bimart-tables", "recordings", "soak", "speed")  # they need data or a network, and run for hours
 
 
 def main() -> int:

@@ -15,6 +15,7 @@ from pipelines.expected_orderings import read_methods
 from pipelines.params import chosen_params, load_yaml
 
 BY_METRIC = ("figures", "intervals", "counts", "notes", "unmeasured")  # parts of a metrics file, each by metric
+TEXT2HOI = ("text2hoi", "text2hoi-coarse", "other-prompt")  # families of models/text2hoi/dvc.yaml
 Methods = dict[str, dict[str, Any]]  # metrics files by family or control
 
 
@@ -30,6 +31,7 @@ def open_project(folder: Path, settings: Mapping[str, Any]) -> None:
     if not (folder / "dvc.yaml").is_file():
         _hoidata("init", str(folder), folder=Path.cwd())
     write_params(folder / "params.yaml", settings)
+    sample_only(folder, settings.get("families", ()))
     for name, root in raw.items():
         _hoidata("raw", "scan", name, "--root", str(root), folder=folder)
 
@@ -41,6 +43,15 @@ def reproduce(folder: Path, *targets: str) -> None:
 
 def _hoidata(*words: str, folder: Path) -> None:
     subprocess.run([sys.executable, "-m", "hoidata", *words], cwd=folder, check=True)
+
+
+def sample_only(folder: Path, families: Collection[str]) -> None:
+    """Take families of Text2HOI that are not in ``families``, if there are any, out of the project's stage `sample`."""
+    stages = (FOLDER / "models/text2hoi/dvc.yaml").read_text()
+    chosen = [name for name in TEXT2HOI if name in families] or TEXT2HOI
+    (folder / "models/text2hoi/dvc.yaml").write_text(
+        stages.replace(f"family: [{', '.join(TEXT2HOI)}]", f"family: [{', '.join(chosen)}]")
+    )
 
 
 def write_params(path: Path, settings: Mapping[str, Any]) -> None:
