@@ -11,7 +11,7 @@ import pytest
 
 from bench import paper_tables
 from bench.paper_tables import METRIC, PaperTable, Row, cell, difference, make
-from bench.project import write_params
+from bench.project import TEXT2HOI, sample_only, write_params
 from hoidata.errors import BadInput
 from hoidata.metrics.intervals import t_interval
 from hoidata.settings import build_config, merge_settings
@@ -19,7 +19,7 @@ from models.common.training import TrainingConfig
 from models.registry import NETWORKS, load_family, load_network
 from models.text2hoi.sampler import SamplingConfig
 from pipelines.expected_orderings import RECORDED
-from pipelines.params import read_params
+from pipelines.params import load_yaml, read_params
 from pipelines.stages.families import families_of
 from pipelines.stages.train import TrainParams
 
@@ -48,6 +48,15 @@ def test_settings_of_every_run_fit_a_project_and_its_rows_are_sampled(table, tmp
     assert all(line.reference in titles for line in table.rows if line.reference)
     assert {line.family for line in table.rows} >= {RECORDED, "static"}
     assert table.metrics <= set(METRIC)
+
+
+@pytest.mark.parametrize("families", [["text2hoi-coarse", "ground-truth"], ["text2hoi", "text2hoi-coarse"], []])
+def test_a_project_samples_only_its_families(families, tmp_path):
+    stages = tmp_path / "models/text2hoi/dvc.yaml"
+    stages.parent.mkdir(parents=True)
+    sample_only(tmp_path, families)
+    matrix = load_yaml(stages.read_bytes())["stages"]["sample"]["matrix"]
+    assert matrix["family"] == [name for name in TEXT2HOI if name in families or not families]
 
 
 @pytest.mark.parametrize("corpus", ["embedded", "study", "arctic"])
