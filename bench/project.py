@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -46,12 +47,10 @@ def _hoidata(*words: str, folder: Path) -> None:
 
 
 def sample_only(folder: Path, families: Collection[str]) -> None:
-    """Take families of Text2HOI that are not in ``families``, if there are any, out of the project's stage `sample`."""
-    stages = (FOLDER / "models/text2hoi/dvc.yaml").read_text()
+    """Let the project's stage `sample` of Text2HOI sample only those in ``families``; all if there are none."""
+    path = folder / "models/text2hoi/dvc.yaml"
     chosen = [name for name in TEXT2HOI if name in families] or TEXT2HOI
-    (folder / "models/text2hoi/dvc.yaml").write_text(
-        stages.replace(f"family: [{', '.join(TEXT2HOI)}]", f"family: [{', '.join(chosen)}]")
-    )
+    path.write_text(re.sub(r"family: \[.*?\]", f"family: [{', '.join(chosen)}]", path.read_text()))
 
 
 def write_params(path: Path, settings: Mapping[str, Any]) -> None:

@@ -14,6 +14,7 @@ from bench.paper_tables import METRIC, PaperTable, Row, cell, difference, make
 from bench.project import TEXT2HOI, sample_only, write_params
 from hoidata.errors import BadInput
 from hoidata.metrics.intervals import t_interval
+from hoidata.package_paths import FOLDER
 from hoidata.settings import build_config, merge_settings
 from models.common.training import TrainingConfig
 from models.registry import NETWORKS, load_family, load_network
@@ -50,13 +51,16 @@ def test_settings_of_every_run_fit_a_project_and_its_rows_are_sampled(table, tmp
     assert table.metrics <= set(METRIC)
 
 
-@pytest.mark.parametrize("families", [["text2hoi-coarse", "ground-truth"], ["text2hoi", "text2hoi-coarse"], []])
-def test_a_project_samples_only_its_families(families, tmp_path):
-    stages = tmp_path / "models/text2hoi/dvc.yaml"
+def test_a_project_samples_only_its_families(tmp_path):
+    stages, shipped = tmp_path / "models/text2hoi/dvc.yaml", FOLDER / "models/text2hoi/dvc.yaml"
     stages.parent.mkdir(parents=True)
-    sample_only(tmp_path, families)
-    matrix = load_yaml(stages.read_bytes())["stages"]["sample"]["matrix"]
-    assert matrix["family"] == [name for name in TEXT2HOI if name in families or not families]
+    stages.write_text(shipped.read_text().replace("python -m", "python3 -m"))
+    for families in (["text2hoi-coarse", "ground-truth"], ["text2hoi", "text2hoi-coarse"], []):
+        sample_only(tmp_path, families)
+        sample = load_yaml(stages.read_bytes())["stages"]["sample"]
+        assert sample["matrix"]["family"] == [name for name in TEXT2HOI if name in families or not families]
+        assert sample["cmd"].startswith("python3 -m")
+    assert stages.read_text() == shipped.read_text().replace("python -m", "python3 -m")
 
 
 @pytest.mark.parametrize("corpus", ["embedded", "study", "arctic"])
