@@ -237,8 +237,9 @@ class Stream:
             self.first_s = self.last_s = time_s
             return True
         elapsed_s = time_s + self._clock_offset_s - self.last_s
-        if elapsed_s == 0 or (elapsed_s < 0 and self._late_frames < MAX_LATE_FRAMES):
-            self._late_frames += elapsed_s < 0
+        is_repeated = abs(elapsed_s) < ROUNDING_S
+        if is_repeated or (elapsed_s < 0 and self._late_frames < MAX_LATE_FRAMES):
+            self._late_frames += not is_repeated
             return False
         if not 0 < elapsed_s <= MAX_PAUSE_S:  # count it as a pause that starts new trajectories
             self._clock_offset_s += self._ahead_s + MARGIN_S - elapsed_s

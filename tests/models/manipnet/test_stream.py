@@ -292,6 +292,17 @@ def test_a_hand_that_appears_later_is_blended_from_its_start_pose(trained: Predi
     assert 0 < apart_m[31] < 0.2 * apart_m.max()
 
 
+@pytest.mark.parametrize("rounding_s", [-1e-12, 0.0, 1e-12])
+def test_a_repeated_time_may_be_rounded_otherwise(trained: Predictor, whole, rounding_s: float) -> None:
+    frames: list[TrackedFrame | None] = [*frames_of(tracked(TRACKER_HZ, 3.0))]
+    for number in range(60, 90):  # more than are needed to set the clock back
+        if (one := frames[number]) is not None:
+            frames[number] = replace(one, time_s=59 / TRACKER_HZ + rounding_s)
+    stream = new_stream(trained)
+    poses = [pose for one in frames if one is not None for pose in stream.push(one)] + stream.finish()
+    assert len(poses) == len(whole)
+
+
 @pytest.mark.parametrize("jump_s", [-2.0, 1e6])
 def test_a_clock_that_is_set_delays_the_stream_by_a_moment_only(trained: Predictor, jump_s: float) -> None:
     control, stream, count = tracked(TRACKER_HZ, 4.0), new_stream(trained), 0
