@@ -190,7 +190,7 @@ def cell(line: Row, results: Results, metric: AnyMetric) -> str:
     """Mean over seeds with the intervals of ``LEGEND``, or the reason for a missing value."""
     seeds = line.values(results, metric.name)
     if not seeds:
-        return line.reason(results, metric.name)
+        return line.reason(results, metric.name).partition(":")[0]
     text, values = number(mean_value(seeds)), {seed["value"] for seed in seeds}
     if (half := half_width(seeds, "repetitions")) is not None:
         text += f" ± {number(half)}"
