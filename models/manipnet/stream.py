@@ -27,7 +27,7 @@ from models.manipnet.rollout import FrameContext, HandRollout, Predictor, frame_
 
 MARGIN_S = 0.25  # frames kept before the oldest trajectory sample, whose velocity needs the frame before it
 ROUNDING_S = 1e-6
-BLEND_S = 0.4
+BLEND_S = 0.3
 MAX_GAP_S = 0.5  # a wrist lost for longer makes frames of a recording invalid
 MAX_SPEED_M_S, MAX_TURN_RAD_S = 10.0, 40.0  # a faster body has jumped; recorded wrists reach 4 m/s
 MAX_LATE_FRAMES, MAX_PAUSE_S = 10, 5.0
