@@ -30,6 +30,8 @@ NETWORKS = ("contact", "length", "diffusion", "refiner", "mdm", "imos", "t2m-mov
 SETTINGS = {
     "profile": "embedded",
     "datasets": ["grab"],
+    # Validation of full networks takes minutes.
+    "split": {"grab": {"by": "subject", "train": "rest", "validation": [], "test": ["s10"]}},
     "family_datasets": {"mdm": ["grab"], "imos": ["grab"], "t2m": ["grab"]},
     "train": {
         "preset": "paper",
