@@ -112,6 +112,11 @@ class ObjectModel:
         """(face, 3) faces of one part."""
         return self.faces[self.face_part == part] if self.is_articulated else self.faces
 
+    def part_mesh(self, part: int) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices (vertex, 3), object frame, and faces (face, 3) of one part, without unused vertices."""
+        used, corners = np.unique(self.faces_of(part), return_inverse=True)
+        return self.vertices_m[used], corners.reshape(-1, 3)
+
     def closed_part(self, part: int) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (vertex, 3) and faces (face, 3) of one part, with the cut between the parts closed.
 

@@ -69,16 +69,9 @@ def _object_motion(track: ObjectTrack) -> tuple[tuple[str, ...], tuple[int, ...]
 def _write_bvh(
     path: Path, names: Iterable[str], tree: tuple[int, ...], positions_m: np.ndarray, rotations: Rotation
 ) -> None:
-    """Write one BVH file.
-
-    Args:
-        tree: index of each joint's parent; -1 for the root.
-        positions_m: (frame, joint, 3) in the parent joint's frame.
-        rotations: (frame x joint) relative to the parent joint.
-    """
-    names = list(names)
+    """Write positions (frame, joint, 3) and rotations (frame x joint) relative to the parents in ``tree``; root: -1."""
     order: list[int] = []
-    lines = ["HIERARCHY", *_joint_lines(0, names, tree, positions_m[0], 0, order)]
+    lines = ["HIERARCHY", *_joint_lines(0, tuple(names), tree, positions_m[0], 0, order)]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Gimbal lock")  # any of the equivalent angle triples will do
         angles_deg = rotations.as_euler("ZXY", degrees=True).reshape(positions_m.shape)
@@ -89,7 +82,7 @@ def _write_bvh(
 
 
 def _joint_lines(
-    joint: int, names: list[str], tree: tuple[int, ...], offsets_m: np.ndarray, depth: int, order: list[int]
+    joint: int, names: tuple[str, ...], tree: tuple[int, ...], offsets_m: np.ndarray, depth: int, order: list[int]
 ) -> list[str]:
     """The hierarchy lines of a joint and its descendants; appends the joints to ``order`` in the order of the lines."""
     order.append(joint)

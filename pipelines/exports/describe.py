@@ -5,7 +5,6 @@ It is derived from the store's facts and has no date, so that equal stores give 
 
 import re
 from collections import Counter
-from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -20,12 +19,12 @@ from hoidata.store.fields import STORE_FILES, StoreFile
 from hoidata.store.info import embedded_hand_warning
 from hoidata.store.store import Store
 from pipelines.exports.licences import OWN_USE, ArrayLicence, licences_of
-from pipelines.exports.motion import Column, write_json
+from pipelines.exports.motion import Format, write_json
 
 _MARKUP = re.compile(r"[\\`*_\[\]|~$]")
 CROISSANT = "http://mlcommons.org/croissant/1.1"
 RESPONSIBLE = "http://mlcommons.org/croissant/RAI/1.0"
-HOMEPAGE = "https://schema.org/Dataset"  # for a dataset without a page
+HOMEPAGE = "https://schema.org/Dataset"  # for a dataset without a page, since Croissant requires an address
 _ENCODINGS = {
     ".parquet": "application/x-parquet",
     ".json": "application/json",
@@ -59,79 +58,56 @@ CONTEXT: dict[str, Any] = {
 }
 
 
-@dataclass(frozen=True)
-class Description:
-    """The facts of an export format that its description states."""
-
-    meaning: str  # one line for people
-    world: str  # the frame of its coordinates
-    untracked: str  # the values of a hand in frames without tracking
-    columns: tuple[Column, ...]  # arrays with a documented meaning
-    for_own_use: bool  # whether it has data that must not be shared
-
-
-def write_description(folder: Path, store: Store, to: str, description: Description) -> None:
+def write_description(folder: Path, store: Store, form: Format, for_own_use: bool) -> None:
     """Write croissant.json and README.md about the files in ``folder``; for the format croissant, about the store."""
-    root = store.folder if to == "croissant" else folder
-    write_json(folder / "croissant.json", croissant(root, store, description))
-    (folder / "README.md").write_text(dataset_card(root, store, description), encoding="utf-8")
+    root = store.folder if form.write is None else folder
+    write_json(folder / "croissant.json", croissant(root, store, form, for_own_use))
+    (folder / "README.md").write_text(dataset_card(root, store, form, for_own_use), encoding="utf-8")
 
 
-def croissant(root: Path, store: Store, description: Description) -> dict[str, Any]:
+def croissant(root: Path, store: Store, form: Format, for_own_use: bool) -> dict[str, Any]:
     """The description of the files below ``root`` as JSON-LD, with relative addresses."""
     info, name = store.info, _name(store)
+    register, version = str(info.get("where_to_register", "")), str(info["dataset_version"]).split(".")
     files = [path for path in sorted(root.rglob("*")) if path.is_file() and not path.name.startswith(".")]
-    facts = dataset_facts(str(info["dataset"]))
     array_licences = licences_of(info)
     values: dict[str, Any] = {
         "@context": CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": [CROISSANT, RESPONSIBLE],
         "name": name,
-        "description": f"{_summary(store)} {_sentence(description.meaning)}",
+        "description": f"{_summary(store)} {_sentence(form.meaning)}",
         "license": list(dict.fromkeys(map(_licence_address, array_licences))),
-        "url": _address(str(info.get("where_to_register", ""))),
-        "version": _version(str(info["dataset_version"])),
+        "url": next((word.strip("(),;") for word in register.split() if word.startswith("https://")), HOMEPAGE),
+        "version": ".".join([*version, "0", "0"][:3]) if all(map(str.isdigit, version)) else "0.0.0",
         "keywords": ["hand-object interaction", "motion", "MANO", str(info["dataset"])],
-        "citeAs": facts.paper if facts and facts.paper else name,
-        **{f"rai:{key}": value for key, value in _responsible(store, description).items()},
+        "citeAs": _paper(info) or name,
+        **{f"rai:{key}": value for key, value in _responsible(store, form).items()},
     }
-    if description.for_own_use:
+    if for_own_use:
         values["usageInfo"] = OWN_USE
     values["distribution"] = [_file_object(root, path, array_licences) for path in files]
-    meanings = {column.name: column.meaning for column in description.columns}
+    meanings = {column.name: column.meaning for column in form.columns}
     values["recordSet"] = [_record_set(root, path, meanings) for path in files if path.suffix == ".parquet"]
     return values
 
 
-def dataset_card(root: Path, store: Store, description: Description) -> str:
+def dataset_card(root: Path, store: Store, form: Format, for_own_use: bool) -> str:
     """README.md with front matter for Hugging Face (licence, files per subset), conventions and licence per array."""
-    info, array_licences = store.info, licences_of(store.info)
-    lines = [
-        f"# {markdown_text(_name(store))}",
-        "",
-        markdown_text(_summary(store)),
-        "",
-        _sentence(description.meaning),
-        "",
-    ]
-    if description.for_own_use:
+    array_licences = licences_of(store.info)
+    lines = [f"# {markdown_text(_name(store))}", "", markdown_text(_summary(store)), "", _sentence(form.meaning), ""]
+    if for_own_use:
         lines += [f"**Exported {OWN_USE}.**", ""]
-    lines += _conventions(info, description)
+    lines += _conventions(store.info, form)
     lines += ["", "## Licence per array", "", "| arrays | content | SPDX | may be shared |", "|---|---|---|---|"]
     lines += [
         f"| {item.kind.name} | {item.kind.meaning} | {item.spdx} | {'yes' if item.may_be_shared else 'no'} |"
         for item in array_licences
     ]
-    lines += [
-        "",
-        *(
-            f"- {item.spdx}: {markdown_text(item.licence)}"
-            for item in {item.spdx: item for item in array_licences}.values()
-        ),
-    ]
+    licence_words = {item.spdx: item.licence for item in array_licences}
+    lines += ["", *(f"- {spdx}: {markdown_text(words)}" for spdx, words in licence_words.items())]
     lines += ["", "## Provenance", ""]
-    for key, value in _responsible(store, description).items():
+    for key, value in _responsible(store, form).items():
         lines.append(f"- {key}: {markdown_text('; '.join(value) if isinstance(value, list) else value)}")
     return f"---\n{_front_matter(root, store, array_licences)}---\n\n" + "\n".join(lines) + "\n"
 
@@ -148,7 +124,7 @@ def _front_matter(root: Path, store: Store, array_licences: tuple[ArrayLicence, 
     return yaml.safe_dump(facts, sort_keys=False, allow_unicode=True)
 
 
-def _conventions(info: dict[str, Any], description: Description) -> list[str]:
+def _conventions(info: dict[str, Any], form: Format) -> list[str]:
     """Markdown lines about frame, units, hand model, and the meaning of each array."""
     frame, hand = info["frame"], info["hand_model"]
     up = f"its up axis is {frame['up_axis']}" if frame["up_axis"] else "its up axis is not stated"
@@ -156,18 +132,17 @@ def _conventions(info: dict[str, Any], description: Description) -> list[str]:
         "## Conventions",
         "",
         f"- Units: metre, radian, second; {info['fps']} frames per second; column vectors; right-handed.",
-        f"- World frame: {description.world}. The source's: {markdown_text(frame['note'])}; {up}; "
-        f"gravity {frame['gravity']}.",
+        f"- World frame: {form.world}. The source's: {markdown_text(frame['note'])}; {up}; gravity {frame['gravity']}.",
         f"- Hand model: {markdown_text(hand['name'])}, SHA-256 {markdown_text(hand['digest'])}. Hand parameters are "
         "relative to it: angles to its flat hand, shape to its template unless a personal rest mesh is given. "
         "The wrist joint is joint 0; it is not MANO's transl.",
-        f"- Frames in which a hand is not tracked are marked; {description.untracked}.",
+        f"- Frames in which a hand is not tracked are marked; {form.untracked}.",
     ]
     if stand_in := embedded_hand_warning(info):
         lines.append(f"- Warning: {markdown_text(stand_in)}.")
-    if description.columns:
+    if form.columns:
         lines += ["", "| array | type | shape | meaning |", "|---|---|---|---|"]
-        lines += [f"| {c.name} | {c.dtype} | {list(c.shape) or ''} | {c.meaning} |" for c in description.columns]
+        lines += [f"| {c.name} | {c.dtype} | {list(c.shape) or ''} | {c.meaning} |" for c in form.columns]
     return lines
 
 
@@ -175,26 +150,24 @@ def _sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def _responsible(store: Store, description: Description) -> dict[str, Any]:
+def _responsible(store: Store, form: Format) -> dict[str, Any]:
     """The responsible-AI terms of Croissant that the facts of a store provide."""
     info, counts, rows = store.info, store.info["counts"], store.sequences
-    facts = dataset_facts(str(info["dataset"]))
     errors_m = rows["fit_error_m"].dropna().tolist()  # of hands fitted to keypoints
     verbs = Counter(rows["verb"].dropna().tolist())
     verbs_by_count = sorted(verbs.items(), key=lambda pair: (-pair[1], str(pair[0])))
-    source = facts.paper if facts and facts.paper else info["dataset"]
     limits = [f"gravity: {info['frame']['gravity']}"]
     if errors_m:
         error_mm = 1000 * sum(errors_m) / len(errors_m)
         limits.append(f"hands of {len(errors_m)} clips are fitted to keypoints, mean error {error_mm:.1f} mm")
-    origin = "generated by code in the raw format of" if info["synthetic"] else "recorded by the authors of"
+    origin = "Generated by code in the raw format of" if info["synthetic"] else "Recorded by the authors of"
     return {
-        "dataCollection": f"{origin[0].upper()}{origin[1:]} {source}; {counts['files']} raw files",
+        "dataCollection": f"{origin} {_paper(info) or info['dataset']}; {counts['files']} raw files",
         "dataCollectionType": ["Synthetic data"] if info["synthetic"] else ["Physical data collection"],
         "dataCollectionRawData": str(info.get("where_to_register", "see dataCollection")),
         "dataCollectionMissingData": (
             f"{counts['quarantined']} sequences or intervals are excluded, with reasons in quarantine.parquet; "
-            f"frames in which a hand is not tracked are marked; {description.untracked}"
+            f"frames in which a hand is not tracked are marked; {form.untracked}"
         ),
         "dataPreprocessingProtocol": [
             f"resampled from {info['source_fps']:g} to {info['fps']} frames per second, metres, right-handed world",
@@ -215,6 +188,11 @@ def _responsible(store: Store, description: Description) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _paper(info: dict[str, Any]) -> str:
+    facts = dataset_facts(str(info["dataset"]))
+    return facts.paper if facts else ""
+
+
 def _name(store: Store) -> str:
     return f"hoidata-{store.info['dataset']}{'-synthetic' if store.info['synthetic'] else ''}"
 
@@ -226,18 +204,6 @@ def _summary(store: Store) -> str:
         f"{kind} in the conventions of {info['dataset']}: {counts['clips']} clips, {counts['frames']} frames, "
         f"{counts['objects']} objects."
     )
-
-
-def _version(text: str) -> str:
-    """A version in the format of Croissant, major.minor.patch."""
-    numbers = text.split(".")
-    return ".".join([*numbers, "0", "0"][:3]) if all(map(str.isdigit, numbers)) else "0.0.0"
-
-
-def _address(text: str) -> str:
-    """The first web address in a text, else a default, since Croissant requires one."""
-    addresses = [word.strip("(),;") for word in text.split() if word.startswith("https://")]
-    return addresses[0] if addresses else HOMEPAGE
 
 
 def _licence_address(item: ArrayLicence) -> str:

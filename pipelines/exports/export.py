@@ -3,7 +3,6 @@
 import io
 import tarfile
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -13,50 +12,22 @@ import orjson
 from rich.console import Console
 from rich.progress import Progress
 
-from hoidata.clips.clip import SIDES, Clip, Side
+from hoidata.clips.clip import SIDES, Side
 from hoidata.errors import BadInput
 from hoidata.files import atomic_folder
 from hoidata.files.arrays import write_npz_to
 from hoidata.store.store import Store
-from pipelines.exports import bvh, hugging_face, lerobot, spider, usd
-from pipelines.exports.describe import Description, write_description
-from pipelines.exports.licences import (
-    HANDS,
-    MESHES,
-    OBJECT,
-    OWN_USE,
-    PERSON,
-    SKIN,
-    WORDS,
-    Kind,
-    check_may_be_shared,
-    licences_of,
-)
-from pipelines.exports.motion import CLIP_COLUMNS, COLUMNS, WORLD, Y_UP, Column, ExportedClip, Source, write_json
+from pipelines.exports import bvh, hugging_face, lerobot, licences, spider, usd
+from pipelines.exports.describe import write_description
+from pipelines.exports.motion import CLIP_COLUMNS, COLUMNS, Y_UP, ExportedClip, Format, Source, write_json
 from pipelines.pages.glb import glb_bytes
 
 CLIPS_PER_SHARD = 500
-_MOTION = (HANDS, OBJECT, WORDS)
-_PARAMETERS = (*_MOTION, PERSON)
+_MOTION = (licences.HANDS, licences.OBJECT)
+_PARAMETERS = (*_MOTION, licences.WORDS, licences.PERSON)
 _COLUMNS = (*COLUMNS, *CLIP_COLUMNS)
-_SCENE = (HANDS, OBJECT, MESHES, PERSON, SKIN)
-
-
-@dataclass(frozen=True)
-class Format:
-    """An export format."""
-
-    meaning: str  # one line for people
-    kinds: tuple[Kind, ...]  # of the arrays it can have
-    write: Callable[[Path, Iterable[ExportedClip]], None] | None  # None: the description alone
-    unsupported: Callable[[Clip], str] = lambda clip: ""  # the reason why it cannot represent a clip; "" if it can
-    world: str = WORLD  # the frame of its coordinates
-    columns: tuple[Column, ...] = ()  # arrays with a documented meaning
-
-    def kinds_in(self, store: Store) -> tuple[Kind, ...]:
-        """The kinds of arrays in an export of this store: personal rest meshes only if the store has some."""
-        templates = store.sequences[[f"{side}_template" for side in SIDES]].notna()
-        return tuple(kind for kind in self.kinds if kind is not PERSON or templates.to_numpy().any())
+_SCENE = (*_MOTION, licences.MESHES, licences.PERSON, licences.SKIN)
+_SPIDER = (*_MOTION, licences.MESHES)
 
 
 def _write_glb(folder: Path, clips: Iterable[ExportedClip]) -> None:
@@ -94,55 +65,41 @@ def _add_to_tar(tar: tarfile.TarFile, key: str, item: ExportedClip) -> None:
         tar.addfile(member, io.BytesIO(content))
 
 
+_LEROBOT = "LeRobot v3: 2 x 21 joints, object, sentences as tasks"
+_HUGGING_FACE = "Parquet with features: datasets.load_dataset(DIR)"
 FORMATS = {
-    "croissant": Format(
-        "croissant.json and a dataset card for the store itself, to be stored next to its meta/", kinds=(), write=None
-    ),
-    "lerobot": Format(
-        "LeRobot v3: 2 x 21 joints, object, sentences as tasks", _MOTION, lerobot.write, columns=lerobot.COLUMNS
-    ),
-    "huggingface": Format(
-        "Parquet with features: datasets.load_dataset(DIR)", _PARAMETERS, hugging_face.write, columns=_COLUMNS
-    ),
-    "webdataset": Format(
-        "tar shards with .npz and .json of each clip", _PARAMETERS, _write_web_dataset, columns=_COLUMNS
-    ),
+    "croissant": Format("croissant.json and a dataset card for the store itself, to be stored next to its meta/"),
+    "lerobot": Format(_LEROBOT, (*_MOTION, licences.WORDS), lerobot.write, lerobot.COLUMNS),
+    "huggingface": Format(_HUGGING_FACE, _PARAMETERS, hugging_face.write, _COLUMNS),
+    "webdataset": Format("tar shards with .npz and .json of each clip", _PARAMETERS, _write_web_dataset, _COLUMNS),
     "glb": Format("an animated scene per clip", _SCENE, _write_glb, world=Y_UP),
     "usd": Format("a stage per clip, meshes with time samples", _SCENE, usd.write, world=Y_UP),
-    "bvh": Format("a skeleton per hand, and the object's motion", (HANDS, OBJECT), bvh.write, world=Y_UP),
-    "spider": Format(
-        "SPIDER's keypoints and meshes",
-        (HANDS, OBJECT, MESHES),
-        spider.write,
-        unsupported=spider.unsupported,
-        world=spider.WORLD,
-    ),
+    "bvh": Format("a skeleton per hand, and the object's motion", _MOTION, bvh.write, world=Y_UP),
+    "spider": Format("SPIDER's keypoints and meshes", _SPIDER, spider.write, (), spider.WORLD, spider.unsupported),
 }
 
 
 def export_store(
     store: Store, to: str, out: Path, clip_ids: tuple[str, ...] = (), for_own_use: bool = False, progress: bool = True
 ) -> dict[str, Any]:
-    """Write the clips of a store into a new folder. Equal stores give equal bytes.
+    """Write the clips ``clip_ids``, or all, into a new folder; returns the content of export.json.
 
-    Args:
-        clip_ids: the clips to export; empty for all.
-
-    Returns:
-        The content of export.json.
+    Equal stores give equal bytes.
 
     Raises:
         BadInput: the format or a clip is unknown, the store has no clips, ``out`` exists, or a licence forbids sharing.
     """
     if to not in FORMATS:
         raise BadInput("--to", f"one of {', '.join(FORMATS)}", repr(to), "choose one")
-    form = FORMATS[to]
+    form, existing = FORMATS[to], "an existing file or folder"
     if out.exists():
-        raise BadInput(
-            out, "a path that does not exist", "an existing file or folder", "choose another name, or remove it"
-        )
-    _check_clips(store, clip_ids)
-    check_may_be_shared(str(store.folder), store.info, form.kinds_in(store), for_own_use)
+        raise BadInput(out, "a path that does not exist", existing, "choose another name, or remove it")
+    if not len(store):
+        raise BadInput(store.folder, "a store with clips", "none", "convert raw data first")
+    if unknown := [clip_id for clip_id in clip_ids if clip_id not in store.sequences.index]:
+        examples = ", ".join(store.ids[:3])
+        raise BadInput("--clip", f"ids of clips of {store.folder}", unknown[0], f"choose one, such as {examples}")
+    licences.check_may_be_shared(str(store.folder), store.info, form.kinds_in(store), for_own_use)
     source, skipped = Source(store, clip_ids), {}
     with atomic_folder(out) as partial, Progress(console=Console(stderr=True), disable=not progress) as bar:
         if form.write is not None:
@@ -152,19 +109,9 @@ def export_store(
             reason = next(iter(skipped.values()))
             raise BadInput(store.folder, f"clips that {to} can represent", f"none: {reason}", "choose another format")
         facts = _facts(store, to, form, for_own_use) | {"clips": len(source.ids) - len(skipped), "left_out": skipped}
-        untracked = "their values are undefined" if form.write is None else "they repeat its last tracked pose"
-        description = Description(form.meaning, form.world, untracked, columns=form.columns, for_own_use=for_own_use)
         write_json(partial / "export.json", facts)
-        write_description(partial, store, to, description)
+        write_description(partial, store, form, for_own_use)
     return facts
-
-
-def _check_clips(store: Store, clip_ids: tuple[str, ...]) -> None:
-    if not len(store):
-        raise BadInput(store.folder, "a store with clips", "none", "convert raw data first")
-    if unknown := [clip_id for clip_id in clip_ids if clip_id not in store.sequences.index]:
-        examples = ", ".join(store.ids[:3])
-        raise BadInput("--clip", f"ids of clips of {store.folder}", unknown[0], f"choose one, such as {examples}")
 
 
 def _clips(source: Source, form: Format, skipped: dict[str, str], done: Callable[[], None]) -> Iterator[ExportedClip]:
@@ -179,14 +126,11 @@ def _clips(source: Source, form: Format, skipped: dict[str, str], done: Callable
 
 
 def _facts(store: Store, to: str, form: Format, for_own_use: bool) -> dict[str, Any]:
-    info, array_licences = store.info, licences_of(store.info)
+    kinds = form.kinds_in(store) or licences.KINDS
     return {
         "format": to,
-        "dataset": info["dataset"],
-        "dataset_version": info["dataset_version"],
-        "synthetic": info["synthetic"],
-        "hand_model": info["hand_model"],
+        **{key: store.info[key] for key in ("dataset", "dataset_version", "synthetic", "hand_model")},
         "world": form.world,
-        "terms": OWN_USE if for_own_use else "may be shared under the licences below",
-        "licences": [item.as_json() for item in array_licences if item.kind in (form.kinds_in(store) or [item.kind])],
+        "terms": licences.OWN_USE if for_own_use else "may be shared under the licences below",
+        "licences": [item.as_json() for item in licences.licences_of(store.info) if item.kind in kinds],
     }

@@ -44,15 +44,14 @@ def _row(item: ExportedClip) -> pa.Table:
 
 
 def _schema() -> pa.Schema:
-    fields: list[Any] = [(name, pa.string()) for name in _TEXTS]
-    fields += [("sentences", pa.list_(pa.string()))]
-    fields += [(column.name, pa.list_(row_type(column))) for column in COLUMNS]
-    fields += [(column.name, row_type(column)) for column in CLIP_COLUMNS]
+    columns = [(name, pa.string(), _value("string")) for name in _TEXTS]
+    columns += [("sentences", pa.list_(pa.string()), _list(_value("string")))]
+    columns += [(column.name, pa.list_(row_type(column)), _list(_feature(column))) for column in COLUMNS]
+    columns += [(column.name, row_type(column), _feature(column)) for column in CLIP_COLUMNS]
     # Nested fields are called "item", as datasets calls them.
-    features: dict[str, Any] = {name: _value("string") for name in _TEXTS} | {"sentences": _list(_value("string"))}
-    features |= {column.name: _list(_feature(column)) for column in COLUMNS}
-    features |= {column.name: _feature(column) for column in CLIP_COLUMNS}
-    return pa.schema(fields, {"huggingface": orjson.dumps({"info": {"features": features}}).decode()})
+    features = {name: feature for name, _, feature in columns}
+    metadata = {"huggingface": orjson.dumps({"info": {"features": features}}).decode()}
+    return pa.schema([(name, dtype) for name, dtype, _ in columns], metadata)
 
 
 def _feature(column: Column) -> dict[str, Any]:

@@ -16,8 +16,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hoidata.clips.clip import FPS, SIDES
+from hoidata.hands import JOINT_NAMES
 from hoidata.store.annotated import SUBSETS
-from pipelines.exports.motion import Column, ExportedClip, frames_array, row_type, state_names, write_json
+from pipelines.exports.motion import Column, ExportedClip, frames_array, row_type, write_json
 
 VERSION = "v3.0"
 FRAMES_PER_FILE = 60_000  # about 100 MB, LeRobot's default size of a data file
@@ -28,7 +29,7 @@ STATE, ACTION, OBJECT = "observation.state", "action", "observation.environment_
 # Without the prefix "action.": LeRobot's policies predict all features with that prefix.
 VALID, NEXT_VALID = "observation.hand_valid", "next.hand_valid"
 _OBJECT_NAMES = [*(f"object.{axis}" for axis in "xyz"), *(f"object.q{axis}" for axis in "xyzw"), "object.hinge"]
-_HAND_NAMES = [name for side in SIDES for name in state_names(side)]
+_HAND_NAMES = [f"{side}.{joint}.{axis}" for side in SIDES for joint in JOINT_NAMES for axis in "xyz"]
 _NAMES = {STATE: _HAND_NAMES, ACTION: _HAND_NAMES, OBJECT: _OBJECT_NAMES, VALID: list(SIDES), NEXT_VALID: list(SIDES)}
 _POSE = "origin of the object frame, quaternion xyzw of world_from_object, hinge angle from the mesh as stored"
 _TRACKED = (
@@ -47,6 +48,7 @@ COLUMNS = (
     Column("index", "int64", (), "frame of the data set, from 0"),
     Column("task_index", "int64", (), "row of meta/tasks.parquet: the clip's first sentence"),
 )
+_SCHEMA = pa.schema([(column.name, row_type(column)) for column in COLUMNS])
 
 
 def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
@@ -65,43 +67,34 @@ class _Writer:
         self.tasks: dict[str, int] = {}
         self.ranges: dict[str, list[int]] = {}
         self.frames, self.file, self.in_file = 0, 0, 0
-        self._parquet: pq.ParquetWriter | None = None
+        self._parquet = self._open_file()
 
     def add(self, item: ExportedClip) -> None:
         """Add an episode: a row group of the data file, and a row of meta/episodes."""
         task_indices = [self.tasks.setdefault(sentence, len(self.tasks)) for sentence in item.sentences]
-        arrays = _frames(item) | self._indices(item.clip.n_frames, task_indices[0])
-        if self._parquet is None or self.in_file + item.clip.n_frames > FRAMES_PER_FILE:
-            self._next_file()
-        assert self._parquet is not None
+        n_frames, frame = item.clip.n_frames, np.arange(item.clip.n_frames)
+        arrays = _frames(item) | {"timestamp": frame / FPS, "frame_index": frame, "index": frame + self.frames}
+        arrays["episode_index"] = np.full(n_frames, len(self.episodes))
+        arrays["task_index"] = np.full(n_frames, task_indices[0])
+        if self.in_file and self.in_file + n_frames > FRAMES_PER_FILE:
+            self._parquet.close()
+            self.file, self.in_file = self.file + 1, 0
+            self._parquet = self._open_file()
         data = [frames_array(arrays[column.name], column) for column in COLUMNS]
-        self._parquet.write_table(pa.Table.from_arrays(data, schema=_schema()))
+        self._parquet.write_table(pa.Table.from_arrays(data, schema=_SCHEMA))
         self.episodes.append(self._episode(item))
         masks = _valid_values(item, arrays)
         for name, episodes in self.statistics.items():
             episodes.append(_statistics(arrays[name], masks.get(name, True)))
         self.ranges.setdefault(item.subset, [len(self.episodes) - 1, 0])[1] = len(self.episodes)
-        self.frames += item.clip.n_frames
-        self.in_file += item.clip.n_frames
+        self.frames += n_frames
+        self.in_file += n_frames
 
-    def _indices(self, n_frames: int, task: int) -> dict[str, np.ndarray]:
-        frame = np.arange(n_frames)
-        return {
-            "timestamp": frame / FPS,
-            "frame_index": frame,
-            "episode_index": np.full(n_frames, len(self.episodes)),
-            "index": frame + self.frames,
-            "task_index": np.full(n_frames, task),
-        }
-
-    def _next_file(self) -> None:
-        if self._parquet is not None:
-            self._parquet.close()
-            self.file += 1
+    def _open_file(self) -> pq.ParquetWriter:
         chunk, file = divmod(self.file, FILES_PER_CHUNK)
         path = self.folder / DATA_PATH.format(chunk_index=chunk, file_index=file)
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._parquet, self.in_file = pq.ParquetWriter(path, _schema()), 0
+        return pq.ParquetWriter(path, _SCHEMA)
 
     def _episode(self, item: ExportedClip) -> dict[str, Any]:
         chunk, file = divmod(self.file, FILES_PER_CHUNK)
@@ -124,7 +117,6 @@ class _Writer:
 
     def finish(self) -> None:
         """Write the files of meta/."""
-        assert self._parquet is not None
         self._parquet.close()
         path = self.folder / EPISODES_PATH
         path.parent.mkdir(parents=True)
@@ -136,13 +128,10 @@ class _Writer:
         pq.write_table(pa.Table.from_pylist(self.episodes), path)
         tasks = pd.DataFrame({"task_index": list(self.tasks.values())}, pd.Index(list(self.tasks), name="task"))
         tasks.to_parquet(self.folder / "meta" / "tasks.parquet")
-        write_json(self.folder / "meta" / "info.json", self._info())
         statistics = {name: _as_written(total, total) for name, total in totals.items()}
         write_json(self.folder / "meta" / "stats.json", statistics)
-
-    def _info(self) -> dict[str, Any]:
         splits = {name: "{}:{}".format(*self.ranges[name]) for name in SUBSETS if name in self.ranges}
-        return {
+        info = {
             "codebase_version": VERSION,
             "robot_type": "human_hands",
             "total_episodes": len(self.episodes),
@@ -155,8 +144,12 @@ class _Writer:
             "splits": splits or {"train": f"0:{len(self.episodes)}"},
             "data_path": DATA_PATH,
             "video_path": None,
-            "features": {c.name: _feature(c) for c in COLUMNS},
+            "features": {
+                c.name: {"dtype": c.dtype, "shape": list(c.shape or (1,)), "names": _NAMES.get(c.name), "fps": FPS}
+                for c in COLUMNS
+            },
         }
+        write_json(self.folder / "meta" / "info.json", info)
 
 
 def _frames(item: ExportedClip) -> dict[str, np.ndarray]:
@@ -217,11 +210,3 @@ def _as_written(statistics: dict[str, np.ndarray], total: dict[str, np.ndarray])
     filled = {name: np.where(statistics["count"] > 0, statistics[name], total[name]) for name in names}
     written = {name: np.nan_to_num(values, nan=0.0).tolist() for name, values in filled.items()}
     return written | {"count": [int(statistics["count"].max())]}
-
-
-def _schema() -> pa.Schema:
-    return pa.schema([(column.name, row_type(column)) for column in COLUMNS])
-
-
-def _feature(column: Column) -> dict[str, Any]:
-    return {"dtype": column.dtype, "shape": list(column.shape or (1,)), "names": _NAMES.get(column.name), "fps": FPS}

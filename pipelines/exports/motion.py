@@ -1,6 +1,7 @@
 """The arrays and facts of one exported clip, which all formats use: joints, parameters, object poses, sentences."""
 
 import re
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -13,9 +14,10 @@ import pyarrow as pa
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.files.written import read_table
 from hoidata.geometry.intervals import runs
-from hoidata.hands import JOINT_NAMES, HandPair
+from hoidata.hands import HandPair
 from hoidata.store.annotated import SUBSETS
 from hoidata.store.store import Store
+from pipelines.exports.licences import PERSON, Kind
 from pipelines.pages.glb import continuous_quaternions
 
 MAX_NAME_BYTES = 150  # file systems permit 255, including suffixes
@@ -38,14 +40,14 @@ _REPEATED = "untracked frames repeat the last tracked pose, or before the first 
 _POSE = "axis-angles of 15 finger joints relative to their parents; zero is the hand model's flat hand"
 _BETAS = "shape coefficients on the hand model's template; NaN if {}_template_m alone is the shape"
 _TEMPLATE = "778 vertices of the person's {} rest mesh, which replaces the hand model's template, metre; "
+_VALID = f"whether the hand is tracked; {_REPEATED}; zeros if it is never tracked in the clip"
+_HINGE = "joint position from the mesh as stored: hinge angle in radian, slide in metre; 0 if rigid"
 
 
 def _hand_columns(side: Side) -> tuple[Column, ...]:
-    """The columns of one hand."""
-    valid = f"whether the hand is tracked; {_REPEATED}; zeros if it is never tracked in the clip"
     return (
         Column(f"{side}_joints_m", "float32", (21, 3), _JOINTS),
-        Column(f"{side}_valid", "bool", (), valid),
+        Column(f"{side}_valid", "bool", (), _VALID),
         Column(f"{side}_global_orient", "float32", (3,), "axis-angle of the wrist joint; world frame, radian"),
         Column(f"{side}_hand_pose", "float32", (45,), f"{_POSE}, not its mean pose; radian"),
         Column(f"{side}_betas", "float32", (10,), _BETAS.format(side)),
@@ -57,12 +59,7 @@ COLUMNS = (
     *_hand_columns("right"),
     Column("object_translation_m", "float32", (3,), "origin of the object frame; world frame, metre"),
     Column("object_quaternion_xyzw", "float32", (4,), "world_from_object rotation, column vectors"),
-    Column(
-        "object_hinge_rad",
-        "float32",
-        (),
-        "joint position from the mesh as stored: hinge angle in radian, slide in metre; 0 if rigid",
-    ),
+    Column("object_hinge_rad", "float32", (), _HINGE),
     Column("source_frames", "int32", (), "index in the source file, from 0"),
 )
 CLIP_COLUMNS = (
@@ -72,6 +69,28 @@ CLIP_COLUMNS = (
         for side in SIDES
     ),
 )
+
+
+@dataclass(frozen=True)
+class Format:
+    """An export format."""
+
+    meaning: str  # one line for people
+    kinds: tuple[Kind, ...] = ()  # of the arrays it can have
+    write: "Callable[[Path, Iterable[ExportedClip]], None] | None" = None  # None: the description alone
+    columns: tuple[Column, ...] = ()  # arrays with a documented meaning
+    world: str = WORLD  # the frame of its coordinates
+    unsupported: Callable[[Clip], str] = lambda clip: ""  # the reason why it cannot represent a clip; "" if it can
+
+    def kinds_in(self, store: Store) -> tuple[Kind, ...]:
+        """The kinds of arrays in an export of this store: personal rest meshes only if the store has some."""
+        templates = store.sequences[[f"{side}_template" for side in SIDES]].notna()
+        return tuple(kind for kind in self.kinds if kind is not PERSON or templates.to_numpy().any())
+
+    @property
+    def untracked(self) -> str:
+        """The values of a hand in frames without tracking, in words."""
+        return "their values are undefined" if self.write is None else "they repeat its last tracked pose"
 
 
 @dataclass(frozen=True)
@@ -125,13 +144,9 @@ class ExportedClip:
         arrays: dict[str, Any] = {"source_frames": clip.source_frames}
         for side in SIDES:
             hand = clip.hands[side]
-            arrays |= {
-                f"{side}_joints_m": self.joints[side],
-                f"{side}_valid": hand.valid,
-                f"{side}_global_orient": hand.global_orient,
-                f"{side}_hand_pose": hand.hand_pose,
-                f"{side}_betas": np.broadcast_to(_betas(hand), (clip.n_frames, 10)),
-            }
+            arrays |= {f"{side}_{name}": getattr(hand, name) for name in ("valid", "global_orient", "hand_pose")}
+            arrays |= {f"{side}_joints_m": self.joints[side]}
+            arrays |= {f"{side}_betas": np.broadcast_to(_betas(hand), (clip.n_frames, 10))}
         arrays |= {"object_translation_m": track.translation_m, "object_hinge_rad": hinge_of(track)}
         arrays["object_quaternion_xyzw"] = continuous_quaternions(track.rotvec)
         return {column.name: np.ascontiguousarray(arrays[column.name], column.dtype) for column in COLUMNS}
@@ -150,8 +165,7 @@ def file_name_of(label: str) -> str:
 
     Different labels get different names, and no name leaves the folder, since labels are text of untrusted files.
     """
-    parts = [_ESCAPED.sub(lambda match: f"%{ord(match.group()):02X}", part) for part in label.split("/")]
-    name = "__".join(parts)
+    name = "__".join(_ESCAPED.sub(lambda match: f"%{ord(match.group()):02X}", part) for part in label.split("/"))
     if len(name.encode()) > MAX_NAME_BYTES:
         name = f"{name.encode()[:MAX_NAME_BYTES].decode(errors='ignore')}-{sha256(label.encode()).hexdigest()[:12]}"
     return name
@@ -177,18 +191,15 @@ def hinge_of(track: ObjectTrack) -> np.ndarray:
 
 
 class Source:
-    """The clips of a store, with sentences and subsets from the folders of the stages next to it, if present.
-
-    Args:
-        clip_ids: the clips to export; empty for all.
-    """
+    """The clips ``clip_ids`` of a store, or all, with sentences and subsets of the stages next to it, if present."""
 
     def __init__(self, store: Store, clip_ids: tuple[str, ...] = ()) -> None:
         self.store = store
         root = store.folder.parent
         self._sentences = _grouped(root / "annotation" / "text.parquet", "sentence")
         self._subsets = _grouped(root / "splits" / "splits.parquet", "split")
-        self.ids = sorted(clip_ids or store.ids, key=self._subset_order)
+        # Clips of a subset follow each other, in the order of the store.
+        self.ids = sorted(clip_ids or store.ids, key=lambda clip_id: [*SUBSETS, ""].index(self._subset(clip_id)))
 
     def clip(self, clip_id: str) -> ExportedClip:
         """One clip with its joints and sentences."""
@@ -197,22 +208,12 @@ class Source:
         for side in SIDES:
             hands[side], joints[side] = _filled_untracked(hands[side], self.store.joints(clip_id, side))
         sentences = self._sentences.get(clip_id) or [f"{clip.verb} the {clip.object_words}" if clip.verb else ""]
-        return ExportedClip(
-            replace(clip, hands=hands),
-            joints,
-            self.store.hand_pair(),
-            sentences=tuple(map(str, sentences)),
-            subset=self.subset(clip_id),
-        )
+        filled, words = replace(clip, hands=hands), tuple(map(str, sentences))
+        return ExportedClip(filled, joints, self.store.hand_pair(), words, self._subset(clip_id))
 
-    def subset(self, clip_id: str) -> str:
-        """train, validation or test; empty if the clip is in none."""
+    def _subset(self, clip_id: str) -> str:
         subset = self._subsets.get(clip_id, [None])[0]
         return subset if subset in SUBSETS else ""
-
-    def _subset_order(self, clip_id: str) -> int:
-        """Sort key: clips of a subset follow each other, in the order of the store."""
-        return [*SUBSETS, ""].index(self.subset(clip_id))
 
 
 def _grouped(path: Path, column: str) -> dict[str, list[Any]]:
@@ -223,22 +224,14 @@ def _grouped(path: Path, column: str) -> dict[str, list[Any]]:
     return {str(key): group[column].tolist() for key, group in rows.groupby("clip_id", sort=False)}
 
 
-def state_names(side: Side) -> list[str]:
-    """Names of the 63 joint coordinates of one hand."""
-    return [f"{side}.{joint}.{axis}" for joint in JOINT_NAMES for axis in "xyz"]
-
-
 def write_json(path: Path, values: dict[str, Any]) -> None:
     """Write indented JSON in the order of the values."""
     path.write_bytes(orjson.dumps(values, option=orjson.OPT_INDENT_2) + b"\n")
 
 
-_ARROW = {"float32": pa.float32(), "int32": pa.int32(), "int64": pa.int64(), "bool": pa.bool_()}
-
-
 def row_type(column: Column) -> pa.DataType:
     """The Arrow type of one frame: a value or nested lists of fixed length; -1 means any length."""
-    kind: pa.DataType = _ARROW[column.dtype]
+    kind = pa.type_for_alias(column.dtype)
     for length in reversed(column.shape):
         kind = pa.list_(kind, length)
     return kind

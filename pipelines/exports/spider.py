@@ -30,21 +30,15 @@ def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
     """Write processed/<dataset>/ below ``folder``."""
     for item in clips:
         root = folder / "processed" / file_name_of(item.clip.dataset)
-        embodiment = _embodiment(item.clip)
+        objects, model, embodiment = root / "assets" / "objects", item.clip.object.model, _embodiment(item.clip)
         part_of = _part_of_hand(item, embodiment)
-        folders = {
-            side: _write_mesh(root / "assets" / "objects", item.clip.object.model, part_of[side]) for side in part_of
-        }
+        meshes = {side: str(_write_mesh(objects, model, part).relative_to(folder)) for side, part in part_of.items()}
         task = root / "mano" / embodiment / item.file_name
         (task / "0").mkdir(parents=True)
         write_npz(task / "0" / "trajectory_keypoints.npz", _keypoints(item, embodiment, part_of))
-        meshes = {
-            f"{side}_object_mesh_dir": str(folders[side].relative_to(folder)) if side in folders else None
-            for side in SIDES
-        }
         info = {"task": item.file_name, "dataset_name": item.clip.dataset, "robot_type": "mano", "data_id": 0}
-        info |= {"embodiment_type": embodiment, "hand_type": embodiment, "ref_dt": 1 / FPS, **meshes}
-        write_json(task / "task_info.json", info)
+        info |= {"embodiment_type": embodiment, "hand_type": embodiment, "ref_dt": 1 / FPS}
+        write_json(task / "task_info.json", info | {f"{side}_object_mesh_dir": meshes.get(side) for side in SIDES})
 
 
 def unsupported(clip: Clip) -> str:
@@ -136,10 +130,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _obj(model: ObjectModel, part: int | None) -> str:
-    vertices_m, faces = model.vertices_m, model.faces
-    if part is not None:
-        used, corners = np.unique(model.faces_of(part), return_inverse=True)
-        vertices_m, faces = vertices_m[used], corners.reshape(-1, 3)
+    vertices_m, faces = (model.vertices_m, model.faces) if part is None else model.part_mesh(part)
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices_m]
     lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
     return "\n".join(lines) + "\n"

@@ -18,13 +18,7 @@ from hoidata.clips.clip import FPS, SIDES, ObjectTrack, Side
 from hoidata.errors import MissingResource
 from hoidata.hands import track_vertices
 from pipelines.exports.motion import ExportedClip, hinge_of
-from pipelines.pages.glb import (
-    HAND_COLOURS,
-    MOVING_PART_COLOUR,
-    OBJECT_COLOUR,
-    continuous_quaternions,
-    upright_rotation,
-)
+from pipelines.pages import glb
 
 
 def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
@@ -50,7 +44,7 @@ def _write_stage(path: Path, item: ExportedClip) -> None:
     stage.SetFramesPerSecond(FPS)
     stage.SetStartTimeCode(0)
     stage.SetEndTimeCode(item.clip.n_frames - 1)
-    world = _transform(stage, "/world", np.zeros((1, 3)), upright_rotation(item.clip.gravity).as_rotvec()[None])
+    world = _transform(stage, "/world", np.zeros((1, 3)), glb.upright_rotation(item.clip.gravity).as_rotvec()[None])
     stage.SetDefaultPrim(world)
     world.SetCustomDataByKey("clip", item.clip.clip_id)
     world.SetCustomDataByKey("facts", orjson.dumps(item.motion_facts).decode())
@@ -66,7 +60,7 @@ def _write_stage(path: Path, item: ExportedClip) -> None:
 def _add_hand(stage: Any, item: ExportedClip, side: Side) -> None:
     track = item.clip.hands[side]
     vertices = track_vertices(track, item.hands[side])
-    mesh = _mesh(stage, f"/world/{side}_hand", vertices[0], np.asarray(item.hands[side].faces), HAND_COLOURS[side])
+    mesh = _mesh(stage, f"/world/{side}_hand", vertices[0], np.asarray(item.hands[side].faces), glb.HAND_COLOURS[side])
     joints = _usd("UsdGeom").Points.Define(stage, f"/world/{side}_joints")
     joints.CreateWidthsAttr([0.004] * 21)
     for frame in range(track.n_frames):
@@ -82,17 +76,12 @@ def _add_hand(stage: Any, item: ExportedClip, side: Side) -> None:
 def _add_object(stage: Any, path: str, track: ObjectTrack) -> None:
     model = track.model
     _transform(stage, path, track.translation_m, track.rotvec)
-    _part_mesh(stage, f"{path}/base", model.vertices_m, model.faces_of(0), OBJECT_COLOUR)
+    _mesh(stage, f"{path}/base", *model.part_mesh(0), glb.OBJECT_COLOUR)
     if model.hinge is None:
         return
     _transform(stage, f"{path}/moving_part", *model.hinge.node_motion(hinge_of(track)))
-    vertices = model.vertices_m - model.hinge.origin_m
-    _part_mesh(stage, f"{path}/moving_part/mesh", vertices, model.faces_of(1), MOVING_PART_COLOUR)
-
-
-def _part_mesh(stage: Any, path: str, vertices_m: np.ndarray, faces: np.ndarray, colour: tuple) -> None:
-    used, compact = np.unique(faces, return_inverse=True)
-    _mesh(stage, path, vertices_m[used], compact.reshape(-1, 3), colour)
+    vertices_m, faces = model.part_mesh(1)
+    _mesh(stage, f"{path}/moving_part/mesh", vertices_m - model.hinge.origin_m, faces, glb.MOVING_PART_COLOUR)
 
 
 def _mesh(stage: Any, path: str, vertices_m: np.ndarray, faces: np.ndarray, colour: tuple) -> Any:
@@ -114,8 +103,8 @@ def _transform(stage: Any, path: str, translation_m: np.ndarray, rotvec: np.ndar
     xform = _usd("UsdGeom").Xform.Define(stage, path)
     double = _usd("UsdGeom").XformOp.PrecisionDouble
     translate, orient = xform.AddTranslateOp(double), xform.AddOrientOp(double)
-    quaternions = continuous_quaternions(rotvec)
-    for frame, (position, (x, y, z, w)) in enumerate(zip(translation_m.tolist(), quaternions.tolist(), strict=True)):
+    quaternions = glb.continuous_quaternions(rotvec).tolist()
+    for frame, (position, (x, y, z, w)) in enumerate(zip(translation_m.tolist(), quaternions, strict=True)):
         time = _usd("Usd").TimeCode.Default() if len(translation_m) == 1 else _usd("Usd").TimeCode(frame)
         translate.Set(_usd("Gf").Vec3d(*position), time)
         orient.Set(_usd("Gf").Quatd(w, x, y, z), time)

@@ -13,16 +13,7 @@ from hoidata.hands import HandPair
 from hoidata.objects.sampling import SampledPoints
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.surface.bimart_maps import REACH_M, STEP_M, packed_map
-from pipelines.pages.clip_page_facts import (
-    ClipSeries,
-    clip_facts,
-    clip_quality,
-    hand_decision,
-    measure_clip,
-    sentence_rows,
-    source_rows,
-    split_rows,
-)
+from pipelines.pages import clip_page_facts as content
 from pipelines.pages.clip_page_timeline import BOTH_COLOUR, SIDE_COLOURS, clip_charts, draw_timeline
 from pipelines.pages.examples import true_contact
 from pipelines.pages.player import Player, contact_player, motion_player, write_page
@@ -41,20 +32,15 @@ def page_name(clip_id: str) -> str:
 def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, hands: HandPair) -> Path:
     """Write the page of one clip; equal inputs give equal bytes.
 
-    Args:
-        annotated: the dataset of the clip, with the output of quality control next to it.
-
-    Raises:
-        MissingResource: quality control has not run; the message names its stage.
+    Raises MissingResource without the output of quality control next to the dataset; the message names its stage.
     """
     clip = annotated.clip(clip_id)
-    quality = clip_quality(annotated.root / "quality", clip_id)
-    series = measure_clip(annotated, clip, hands)
+    quality = content.clip_quality(annotated.root / "quality", clip_id)
+    series = content.measure_clip(annotated, clip, hands)
     points = annotated.points(annotated.object_key(clip_id))
     sides: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
-    title = f"{clip.verb or 'move'}: {clip.object_words}"
-    if clip_id in annotated.ids():
-        title = annotated.sentences(clip_id)[0]
+    has_sentences = clip_id in annotated.ids()
+    title = annotated.sentences(clip_id)[0] if has_sentences else f"{clip.verb or 'move'}: {clip.object_words}"
     return write_page(
         path,
         "clip_page.html",
@@ -66,24 +52,24 @@ def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, h
         paint_colours=PAINT_COLOURS,
         distance_colours=DISTANCE_COLOURS,
         reach_cm=REACH_M * 100,
-        threshold_cm=annotated.contact_info["threshold_m"] * 100,
+        threshold_cm=annotated.contact_threshold_m * 100,
         timeline=draw_timeline(clip_charts(series, sides, len(points)), clip_id),
         no_depth=series.depth_m is None,
         maps=_still_maps(clip, series, points),
-        sentences=sentence_rows(annotated, clip_id),
-        left_out="" if clip_id in annotated.ids() else str(annotated.hand_types.at[clip_id, "reason"]),
-        hands=hand_decision(annotated, clip, series),
+        sentences=content.sentence_rows(annotated, clip_id),
+        left_out="" if has_sentences else str(annotated.hand_types.at[clip_id, "reason"]),
+        hands=content.hand_decision(annotated, clip, series),
         quality=quality,
-        splits=split_rows(annotated, clip_id),
-        facts=clip_facts(annotated, clip, hands),
-        files=source_rows(clip),
+        splits=content.split_rows(annotated, clip_id),
+        facts=content.clip_facts(annotated, clip, hands),
+        files=[(source.path, f"{source.size:,}", source.sha256) for source in clip.sources],
         has_players=True,
         script=(Path(__file__).parent / "clip_page.js").read_text(encoding="utf-8"),
     )
 
 
 def paint_values(
-    clip: Clip, points: SampledPoints, touched: Mapping[Side, np.ndarray], maps: Mapping[Side, np.ndarray] | None = None
+    clip: Clip, points: SampledPoints, touched: Mapping[Side, np.ndarray], maps: Mapping[Side, np.ndarray]
 ) -> dict:
     """The data from which clip_page.js paints the contact map of any frame, as a JSON object.
 
@@ -96,8 +82,7 @@ def paint_values(
           mesh of the moving part starts at the hinge), and their indices among all points
         - left, right: touched points per frame, packed bits in base64, first point in the highest bit
         - stride, frames, points: bytes per frame, and the sizes of these arrays
-        - distances: per side, the packed distance map in base64
-        - farthest: the largest packed distance
+        - distances: per side, the packed distance map in base64; farthest: the largest packed distance
     """
     model = clip.object.model
     parts = []
@@ -108,17 +93,19 @@ def paint_values(
         mesh = f"{model.name} {'base' if part == 0 else 'part'} mesh"
         parts.append({"mesh": mesh, "numbers": numbers.tolist(), "tenth_mm": local.reshape(-1).tolist()})
     bits = {side: np.packbits(touched[side], axis=1) for side in SIDES}
-    packed = {side: base64.b64encode(bits[side].tobytes()).decode("ascii") for side in SIDES}
-    distances = {
-        side: base64.b64encode(packed_map(map_m).tobytes()).decode("ascii") for side, map_m in (maps or {}).items()
-    }
+    distances = {side: _base64(packed_map(map_m)) for side, map_m in maps.items()}
     return {
         **{"parts": parts, "stride": int(bits["left"].shape[1]), "frames": clip.n_frames, "points": len(points)},
-        **{"farthest": round(REACH_M / STEP_M), "distances": distances, **packed},
+        **{"farthest": round(REACH_M / STEP_M), "distances": distances},
+        **{side: _base64(packed) for side, packed in bits.items()},
     }
 
 
-def _still_maps(clip: Clip, series: ClipSeries, points: SampledPoints) -> list[Player]:
+def _base64(array: np.ndarray) -> str:
+    return base64.b64encode(array.tobytes()).decode("ascii")
+
+
+def _still_maps(clip: Clip, series: content.ClipSeries, points: SampledPoints) -> list[Player]:
     """Per touching hand, a player of the object, coloured by the fraction of the hand's contact frames per point."""
     players = []
     for side in SIDES:
@@ -126,9 +113,7 @@ def _still_maps(clip: Clip, series: ClipSeries, points: SampledPoints) -> list[P
         if not touching:
             continue
         fraction = series.touched[side].sum(axis=0) / touching
-        paint = ContactPaint(points.points_m, points.part, fraction)
-        n_points = int((fraction > 0).sum())
+        paint, n_points = ContactPaint(points.points_m, points.part, fraction), int((fraction > 0).sum())
         caption = f"{side} hand, {n_points:,} points, in contact in {touching} of {clip.n_frames} frames"
-        label = "fraction of these frames, 0 to 1"
-        players.append(contact_player(clip, paint, caption, caption, label))
+        players.append(contact_player(clip, paint, caption, caption, "fraction of these frames, 0 to 1"))
     return players

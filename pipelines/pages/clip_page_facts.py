@@ -51,28 +51,6 @@ class ClipSeries:
         return HandEvidence(None, distance, self.evidence.threshold_m).at_threshold(self.evidence.threshold_m)
 
 
-@dataclass(frozen=True)
-class HandDecision:
-    """The hand type of a clip with its evidence, as texts."""
-
-    hand_type: str
-    rule: str  # how it is decided
-    agreement: str  # comparison with the label of the source
-    surface: str  # comparison with the exact surface
-    points: int  # number of sampled points of the object
-    hands: Rows  # per hand: side, valid frames, then activity and minimum distance by points and by surface
-
-
-@dataclass(frozen=True)
-class ClipQuality:
-    """Verdict, reasons and measures of quality control for one clip."""
-
-    verdict: str
-    reasons: str
-    note: str
-    measures: Rows  # (measure, value, limit of warnings, limit of exclusion)
-
-
 def sentence_rows(annotated: AnnotatedStore, clip_id: str) -> list[tuple[str, list[str]]]:
     """(form, sentences) of the stage annotate, in its order; empty for a clip without sentences."""
     texts = annotated.text[annotated.text["clip_id"] == clip_id]
@@ -80,42 +58,31 @@ def sentence_rows(annotated: AnnotatedStore, clip_id: str) -> list[tuple[str, li
     return [(str(form), texts.loc[texts["form"] == form, "sentence"].tolist()) for form in forms]
 
 
-def hand_decision(annotated: AnnotatedStore, clip: Clip, series: ClipSeries) -> HandDecision:
-    """The decision of the stage annotate and its evidence."""
+def hand_decision(annotated: AnnotatedStore, clip: Clip, series: ClipSeries) -> dict[str, Any]:
+    """The decision of the stage annotate and its evidence, as texts; hands: the cells of each hand's row."""
     decision = annotated.hand_types.loc[clip.clip_id]
     threshold, points = annotated.annotation_info["threshold_m"], annotated.annotation_info["points"]
-    addition = _annotated_rule(annotated, decision["source"])
-    return HandDecision(
-        hand_type=NOTHING if pd.isna(decision["hand_type"]) else str(decision["hand_type"]),
-        rule=f"A hand is active if one of its 21 joints comes closer than {threshold * 100:g} cm to one of "
-        f"{points:,} sampled points of the object (Text2HOI, supplement 6).{addition}",
-        agreement=_agreement(clip, decision["agreement"]),
-        surface=_surface_words(series),
-        points=points,
-        hands=[_hand_facts(annotated, clip, series, side) for side in SIDES],
+    rule = (
+        f"A hand is active if one of its 21 joints comes closer than {threshold * 100:g} cm to one of "
+        f"{points:,} sampled points of the object (Text2HOI, supplement 6)."
     )
-
-
-def _annotated_rule(annotated: AnnotatedStore, source: Any) -> str:
-    """The addition to the rule if the stage annotate used labels of the source; else ""."""
-    if "annotated" not in set(annotated.hand_types["source"]):
-        return ""
-    used = "as for this clip" if source == "annotated" else "but not for this clip"
-    return f" If the source has a label of the hand, the label is used instead, {used}."
-
-
-def _agreement(clip: Clip, agreement: Any) -> str:
-    if clip.labelled_hand is None:
-        return "The source has no label of the hand."
-    verdict = "which agrees" if bool(agreement) else "which DISAGREES"
-    return f"Label of the source: {clip.labelled_hand}, {verdict}."
-
-
-def _surface_words(series: ClipSeries) -> str:
-    """Whether the exact surface gives the same hand type."""
+    if "annotated" in set(annotated.hand_types["source"]):
+        used = "as for this clip" if decision["source"] == "annotated" else "but not for this clip"
+        rule += f" If the source has a label of the hand, the label is used instead, {used}."
+    agreement = "The source has no label of the hand."
+    if clip.labelled_hand is not None:
+        verdict = "which agrees" if bool(decision["agreement"]) else "which DISAGREES"
+        agreement = f"Label of the source: {clip.labelled_hand}, {verdict}."
     by_points, exact = series.evidence.hand_type or NOTHING, series.surface_evidence.hand_type or NOTHING
-    verdict = "the same" if by_points == exact else f"{exact}, which DIFFERS"
-    return f"With the exact surface in place of sampled points the hand type is {verdict}."
+    is_same = "the same" if by_points == exact else f"{exact}, which DIFFERS"
+    return {
+        "hand_type": NOTHING if pd.isna(decision["hand_type"]) else str(decision["hand_type"]),
+        "rule": rule,
+        "agreement": agreement,
+        "surface": f"With the exact surface in place of sampled points the hand type is {is_same}.",
+        "points": points,
+        "hands": [_hand_facts(annotated, clip, series, side) for side in SIDES],
+    }
 
 
 def _hand_facts(annotated: AnnotatedStore, clip: Clip, series: ClipSeries, side: Side) -> tuple[str, ...]:
@@ -126,26 +93,19 @@ def _hand_facts(annotated: AnnotatedStore, clip: Clip, series: ClipSeries, side:
         return side, count, "no", "never visible", *[""] * 5
     frame = int(distance.argmin())
     within, exact = int(points.near(side).sum()), int(surface.near(side).sum())
-    position = f"frame {frame}{_joint(annotated, clip.clip_id, side, frame)}"
+    entries = annotated.distances(clip.clip_id, side)
+    here = entries.select(entries.frame == frame)  # empty if the contact stage stored no distance of this frame
+    joint = f", {JOINT_NAMES[int(here.joint[here.distance_m.argmin()])]}" if len(here.frame) else ""
+    is_active, is_exactly = ("yes" if frames else "no" for frames in (within, exact))
+    nearest = (f"{distance[frame] * 100:.2f} cm", f"frame {frame}{joint}")
     return (
-        *(side, count, _yes(within), f"{distance[frame] * 100:.2f} cm", position, f"{within} of {clip.n_frames}"),
-        *(_yes(exact), f"{surface.closest_m(side) * 100:.2f} cm", f"{exact} of {clip.n_frames}"),
+        *(side, count, is_active, *nearest, f"{within} of {clip.n_frames}"),
+        *(is_exactly, f"{surface.closest_m(side) * 100:.2f} cm", f"{exact} of {clip.n_frames}"),
     )
 
 
-def _yes(frames: int) -> str:
-    return "yes" if frames else "no"
-
-
-def _joint(annotated: AnnotatedStore, clip_id: str, side: Side, frame: int) -> str:
-    """The name of the closest joint in a frame, if the contact stage stored its distance."""
-    entries = annotated.distances(clip_id, side)
-    here = entries.select(entries.frame == frame)
-    return f", {JOINT_NAMES[int(here.joint[here.distance_m.argmin()])]}" if len(here.frame) else ""
-
-
-def clip_quality(folder: Path, clip_id: str) -> ClipQuality:
-    """The result of quality control. Raises MissingResource if its stage has not run."""
+def clip_quality(folder: Path, clip_id: str) -> dict[str, Any]:
+    """Verdict, reasons and measures of quality control. Raises MissingResource if its stage has not run."""
     require_output(folder, "quality", "clips.parquet")
     record = read_table(folder / "clips.parquet").set_index("clip_id").loc[clip_id]
     limits = read_limits(folder)
@@ -157,7 +117,7 @@ def clip_quality(folder: Path, clip_id: str) -> ClipQuality:
         )
         for measure in CLIP_MEASURES
     ]
-    return ClipQuality(str(record["verdict"]), str(record["reasons"] or ""), str(record["note"] or ""), measures)
+    return {**{name: record[name] or "" for name in ("verdict", "reasons", "note")}, "measures": measures}
 
 
 def _number(value: Any, missing: str = "not measured") -> str:
@@ -179,6 +139,9 @@ def clip_facts(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> Rows:
     info, model = annotated.info, clip.object.model
     kind = "with a hinge" if model.is_articulated else "rigid"
     licence = f"{info['licence']}; derived data {'may be shared' if info['may_be_shared'] else 'not to be shared'}"
+    extras = ["body parameters"] if clip.body is not None else []
+    if clip.source_contact is not None:
+        extras.append(f"contact labels of the source ({len(clip.source_contact.frame):,} entries)")
     return [
         ("clip", clip.clip_id),
         ("dataset", f"{info['dataset']}, version {info['dataset_version']}"),
@@ -192,14 +155,9 @@ def clip_facts(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> Rows:
         ("hands from", _hands_from(clip)),
         ("hand model", "; ".join(filter(None, (hands.name, embedded_hand_warning(annotated.info))))),
         ("camera", _camera(clip)),
-        ("further data", _further(clip)),
+        ("further data", "; ".join(extras) or "nothing"),
         ("licence", licence),
     ]
-
-
-def source_rows(clip: Clip) -> Rows:
-    """(path below the raw folder, bytes, SHA-256) of every raw file of the clip."""
-    return [(source.path, f"{source.size:,}", source.sha256) for source in clip.sources]
 
 
 def _verb(annotated: AnnotatedStore, clip: Clip) -> str:
@@ -238,16 +196,10 @@ def _camera(clip: Clip) -> str:
     if clip.camera is None:
         return NOTHING
     images, lens = clip.camera.images, clip.camera.intrinsics
-    numbers = "" if lens is None else ", ".join(f"{value:g}" for value in np.round(lens, 1))
-    shown = f"; fx, fy, cx, cy, width, height: {numbers}" if numbers else ""
-    return f"{clip.camera.name}, images {int(images[0])} to {int(images[-1])}{shown}"
-
-
-def _further(clip: Clip) -> str:
-    extras = ["body parameters"] if clip.body is not None else []
-    if clip.source_contact is not None:
-        extras.append(f"contact labels of the source ({len(clip.source_contact.frame):,} entries)")
-    return "; ".join(extras) or "nothing"
+    words = f"{clip.camera.name}, images {int(images[0])} to {int(images[-1])}"
+    if lens is not None:
+        words += f"; fx, fy, cx, cy, width, height: {', '.join(f'{value:g}' for value in np.round(lens, 1))}"
+    return words
 
 
 def measure_clip(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> ClipSeries:
@@ -255,12 +207,14 @@ def measure_clip(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> Clip
     points = annotated.points(annotated.object_key(clip.clip_id))
     # The mean of the sampled points: the moving part counts as far as its surface goes.
     centre_m = clip.object.points_in_world(points.points_m, points.part).mean(axis=1)
+    # np.gradient needs two frames.
+    speed_m_s = np.linalg.norm(np.gradient(centre_m, axis=0), axis=1) * FPS if len(centre_m) > 1 else np.zeros(1)
     return ClipSeries(
         touched={side: _touched(annotated, clip, side, len(points)) for side in SIDES},
         evidence=annotated.hand_evidence(clip.clip_id),
         surface={side: measure_hand(clip, side, hands, points) for side in SIDES},
         solid=surface_index(clip.object.model).is_solid,
-        speed_m_s=_speed_m_s(centre_m),
+        speed_m_s=speed_m_s,
         lift_m=None if clip.gravity is None else -(centre_m - centre_m[0]) @ np.asarray(clip.gravity, np.float64),
         hinge_rad=clip.object.hinge_rad,
         is_prismatic=clip.object.model.hinge is not None and clip.object.model.hinge.is_prismatic,
@@ -274,10 +228,3 @@ def _touched(annotated: AnnotatedStore, clip: Clip, side: Side, n_points: int) -
     touched = np.zeros((clip.n_frames, n_points), dtype=bool)
     touched[entries.frame, entries.point] = True
     return touched
-
-
-def _speed_m_s(centre_m: np.ndarray) -> np.ndarray:
-    """(frame,) central differences; 0 for a single frame."""
-    if len(centre_m) < 2:
-        return np.zeros(len(centre_m))
-    return np.linalg.norm(np.gradient(centre_m, axis=0), axis=1) * FPS

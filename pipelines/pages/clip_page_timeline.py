@@ -1,7 +1,8 @@
 """Charts over the frames of one clip with a shared axis, and their positions for the cursor of the page."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -22,8 +23,7 @@ WIDTH_INCHES, ROW_INCHES, FOOT_INCHES = 11.2, 1.0, 0.35
 FARTHEST_CM = 12.0
 
 
-@dataclass(frozen=True)
-class Line:
+class Line(NamedTuple):
     """One line of a chart."""
 
     name: str
@@ -39,69 +39,53 @@ class Chart:
     unit: str
     lines: list[Line]
     least: float  # smallest range of the axis, so that noise of a still object does not fill the chart
-    limit: tuple[float, str] | None = None  # value and name of a dashed line
+    limit: float | None = None  # value of a dashed line
     top: float | None = None  # end of the axis; larger values are cut off
     decimals: int = 1  # of the values under the cursor
 
 
-@dataclass(frozen=True)
-class ChartSpan:
-    """Position and values of a chart on the page."""
-
-    title: str
-    unit: str
-    top: float  # percent of the drawing's height
-    lines: list[dict]  # ``_readout`` of each line
-
-
-@dataclass(frozen=True)
-class Timeline:
+class Timeline(NamedTuple):
     """The drawing of all charts."""
 
     svg: Markup
     left: float  # percent of the width at frame 0
     right: float  # percent of the width at the last frame
-    charts: list[ChartSpan] = field(default_factory=list)
+    charts: list[tuple[float, list[dict]]]  # (position in percent of the drawing's height, ``_readout`` of each line)
 
 
 def clip_charts(series: ClipSeries, sides: Sequence[Side], point_count: int) -> list[Chart]:
     """The charts of a clip page for the hands ``sides``."""
-    threshold_cm = series.evidence.threshold_m * 100
-    touched = [Line(side, SIDE_COLOURS[side], series.touched[side].sum(axis=1).astype(float)) for side in sides]
-    nearest = {side: np.where(np.isfinite(m), m, np.nan) for side, m in series.evidence.distance_m.items()}
-    near = [Line(side, SIDE_COLOURS[side], nearest[side] * 100) for side in sides]
+
+    def lines(values: Mapping[Side, np.ndarray], factor: float = 1.0) -> list[Line]:
+        return [Line(side, SIDE_COLOURS[side], factor * values[side]) for side in sides]
+
+    touched = lines({side: series.touched[side].sum(axis=1) for side in sides})
+    near = lines({side: np.where(np.isfinite(m), m, np.nan) for side, m in series.evidence.distance_m.items()}, 100)
+    vertices = lines({side: series.surface[side].touched.sum(axis=1) for side in sides})
+    title = f"hand vertices within {TOUCH_M * 1000:g} mm of the object's surface"
+    limit_cm = series.evidence.threshold_m * 100
     charts = [
         Chart("touched sampled points", f"of {point_count:,}", touched, 10, decimals=0),
-        Chart(
-            title="distance of the closest joint to the object",
-            unit="cm",
-            lines=near,
-            least=3,
-            limit=(threshold_cm, f"{threshold_cm:g} cm"),
-            top=FARTHEST_CM,
-        ),
+        Chart("distance of the closest joint to the object", "cm", near, 3, limit=limit_cm, top=FARTHEST_CM),
+        Chart(title, "of 778", vertices, 10, decimals=0),
     ]
-    vertices = [
-        Line(side, SIDE_COLOURS[side], series.surface[side].touched.sum(axis=1).astype(float)) for side in sides
-    ]
-    title = f"hand vertices within {TOUCH_M * 1000:g} mm of the object's surface"
-    charts.append(Chart(title, "of 778", vertices, 10, decimals=0))
     if series.depth_m is not None:
-        depths = [Line(side, SIDE_COLOURS[side], series.depth_m[side] * 1000) for side in sides]
+        depths = lines(series.depth_m, 1000)
         charts.append(Chart("depth of the deepest hand vertex in the object", "mm", depths, 2))
     return [chart for chart in charts if chart.lines] + _object_charts(series)
 
 
 def _object_charts(series: ClipSeries) -> list[Chart]:
-    charts = [Chart("speed of the object", "cm/s", [Line("object", OBJECT_COLOUR, series.speed_m_s * 100)], 5)]
+    def line(values: np.ndarray) -> list[Line]:
+        return [Line("object", OBJECT_COLOUR, values)]
+
+    charts = [Chart("speed of the object", "cm/s", line(series.speed_m_s * 100), 5)]
     if series.lift_m is not None:
-        title = "height of the object above its first frame"
-        charts.insert(0, Chart(title, "cm", [Line("object", OBJECT_COLOUR, series.lift_m * 100)], 2))
-    if series.hinge_rad is not None:
-        title, unit, factor, least = (
-            ("slide", "cm", 100.0, 1) if series.is_prismatic else ("hinge angle", "degrees", np.degrees(1.0), 10)
-        )
-        charts.append(Chart(title, unit, [Line("object", OBJECT_COLOUR, factor * series.hinge_rad)], least))
+        charts.insert(0, Chart("height of the object above its first frame", "cm", line(series.lift_m * 100), 2))
+    if series.hinge_rad is not None and series.is_prismatic:
+        charts.append(Chart("slide", "cm", line(100.0 * series.hinge_rad), 1))
+    elif series.hinge_rad is not None:
+        charts.append(Chart("hinge angle", "degrees", line(np.degrees(1.0) * series.hinge_rad), 10))
     return charts
 
 
@@ -118,13 +102,9 @@ def draw_timeline(charts: Sequence[Chart], salt: str) -> Timeline:
 
     svg = figure_svg((WIDTH_INCHES, ROW_INCHES * len(charts) + FOOT_INCHES), salt, draw)
     boxes = [axes.get_position() for axes in drawn]
-    spans = [
-        ChartSpan(
-            chart.title, chart.unit, _percent(1 - box.y1), [_readout(line, chart.decimals) for line in chart.lines]
-        )
-        for chart, box in zip(charts, boxes, strict=True)
-    ]
-    return Timeline(Markup(svg), _percent(boxes[0].x0), _percent(boxes[0].x1), spans)
+    readouts = [[_readout(line, chart.decimals) for line in chart.lines] for chart in charts]
+    tops = [_percent(1 - box.y1) for box in boxes]
+    return Timeline(Markup(svg), _percent(boxes[0].x0), _percent(boxes[0].x1), list(zip(tops, readouts, strict=True)))
 
 
 def _draw_chart(axes: Axes, chart: Chart) -> None:
@@ -140,7 +120,7 @@ def _draw_chart(axes: Axes, chart: Chart) -> None:
     axes.set_axisbelow(True)
     axes.set_title(f"{chart.title}, {chart.unit}", loc="left", fontsize=9, color="#6a6f76")
     if chart.limit:
-        axes.axhline(chart.limit[0], color=LIMIT_COLOUR, linewidth=1.0, linestyle=(0, (4, 3)))
+        axes.axhline(chart.limit, color=LIMIT_COLOUR, linewidth=1.0, linestyle=(0, (4, 3)))
 
 
 def _range(chart: Chart) -> tuple[float, float]:
@@ -148,7 +128,7 @@ def _range(chart: Chart) -> tuple[float, float]:
     values = np.concatenate([line.values for line in chart.lines])
     values = values[np.isfinite(values)]
     low, high = float(values.min(initial=0.0)), float(values.max(initial=0.0))
-    high = max(high, chart.limit[0] * 1.5 if chart.limit else 0.0)
+    high = max(high, (chart.limit or 0.0) * 1.5)
     high = min(high, chart.top) if chart.top is not None else high
     high = max(high, low + chart.least)
     margin = 0.06 * (high - low)

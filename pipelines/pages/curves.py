@@ -5,12 +5,11 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
@@ -29,8 +28,7 @@ _STYLE = {
 }
 
 
-@dataclass(frozen=True)
-class Curve:
+class Curve(NamedTuple):
     """One line of a chart: x and y (point,)."""
 
     name: str
@@ -52,14 +50,23 @@ class Panel:
         return bool(values.min() > 0 and values.max() / values.min() > LOG_RATIO)
 
 
-def panels_svg(panels: list[Panel], x_label: str, salt: str, panel_inches: tuple[float, float] = (2.9, 2.4)) -> str:
+def panels_svg(panels: list[Panel], salt: str) -> str:
     """Charts next to each other as one ``<svg>``; ``salt`` makes the ids of several drawings on a page different."""
 
     def draw(figure: Figure) -> None:
         for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-            _draw_panel(axes, panel, x_label)
+            for number, curve in enumerate(panel.curves):
+                colour, width = COLOURS[number % len(COLOURS)], 1.7 if number == 0 else 1.0
+                axes.plot(curve.x, curve.y, color=colour, linewidth=width, label=curve.name)
+            if panel.is_logarithmic:
+                axes.set_yscale("log")
+            axes.set_xlabel("step")
+            axes.set_title(panel.title, loc="left", fontsize=9, color="#6a6f76")
+            axes.grid(axis="y", color="#ededea", linewidth=0.8)
+            if len(panel.curves) > 1:
+                axes.legend(frameon=False, fontsize=7.5)
 
-    return figure_svg((panel_inches[0] * len(panels), panel_inches[1]), salt, draw)
+    return figure_svg((2.9 * len(panels), 2.4), salt, draw)
 
 
 def figure_svg(inches: tuple[float, float], salt: str, draw: Callable[[Figure], None]) -> str:
@@ -75,33 +82,13 @@ def figure_svg(inches: tuple[float, float], salt: str, draw: Callable[[Figure], 
     return re.sub(r' xmlns(:xlink)?="[^"]*"', "", svg[svg.index("<svg") :])
 
 
-def _draw_panel(axes: Axes, panel: Panel, x_label: str) -> None:
-    for number, curve in enumerate(panel.curves):
-        colour, width = COLOURS[number % len(COLOURS)], 1.7 if number == 0 else 1.0
-        axes.plot(curve.x, curve.y, color=colour, linewidth=width, label=curve.name)
-    if panel.is_logarithmic:
-        axes.set_yscale("log")
-    axes.set_xlabel(x_label)
-    axes.set_title(panel.title, loc="left", fontsize=9, color="#6a6f76")
-    axes.grid(axis="y", color="#ededea", linewidth=0.8)
-    if len(panel.curves) > 1:
-        axes.legend(frameon=False, fontsize=7.5)
-
-
-def read_log(path: str | Path) -> dict[str, np.ndarray]:
-    """The numeric columns of a training log; empty cells are NaN, text columns are skipped."""
-    table = pd.read_csv(path).apply(pd.to_numeric, errors="coerce").dropna(axis="columns", how="all")
-    return {str(name): np.asarray(table[name], np.float64) for name in table}
-
-
-def log_curves(columns: dict[str, np.ndarray], x_name: str = "step") -> list[Curve]:
-    """All loss columns of a log over the step, without empty cells: validation is rarer."""
-    if x_name not in columns:
-        return []
+def log_curves(path: str | Path) -> list[Curve]:
+    """All loss columns of a training log over the step, without empty cells: validation is rarer."""
+    table = pd.read_csv(path).apply(pd.to_numeric, errors="coerce").astype(np.float64)
     curves = []
-    for name, values in columns.items():
-        finite = np.isfinite(values)
-        if name != x_name and re.search("loss|train|valid", name) and finite.any():
-            title = name.removeprefix("train_").replace("_", " ")
-            curves.append(Curve(title, columns[x_name][finite], values[finite]))
+    for name in table.filter(regex="loss|train|valid"):
+        finite = np.isfinite(table[name])
+        if "step" in table and finite.any():
+            title = str(name).removeprefix("train_").replace("_", " ")
+            curves.append(Curve(title, *(np.asarray(table.loc[finite, column]) for column in ("step", name))))
     return curves

@@ -1,6 +1,7 @@
 """The facts of one dataset for the report, read from the outputs of its stages."""
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.store import Store, open_store
 
 MOST_FREQUENT = 12
+UNLABELLED = "no label in the source"
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class DatasetFacts:
     empty: str = ""  # why the dataset has no clips
     tiles: list[tuple[str, str]] = field(default_factory=list)  # (number, name)
     counts: list[tuple[str, list[tuple[str, int]]]] = field(default_factory=list)  # (title, [(name, clips)])
-    quarantine: list[dict[str, str]] = field(default_factory=list)  # records of the store's quarantine table
+    quarantine: list[tuple[str, ...]] = field(default_factory=list)  # (sequence, source, expected, got, remedy)
     annotated: AnnotatedStore | None = None  # None if no clip is annotated
     info: dict = field(default_factory=dict)  # of the store
 
@@ -36,7 +38,7 @@ class DatasetFacts:
     @property
     def reasons(self) -> list[tuple[str, int]]:
         """The violated expectations of skipped sequences with counts, most frequent first."""
-        return _frequent([record["expected"] for record in self.quarantine], "")
+        return _frequent([expected for _, _, expected, _, _ in self.quarantine], "")
 
 
 def read_dataset(root: Path, name: str, hands: HandPair) -> DatasetFacts:
@@ -45,7 +47,7 @@ def read_dataset(root: Path, name: str, hands: HandPair) -> DatasetFacts:
     if not (root / "clips" / "meta" / "info.json").is_file():
         return DatasetFacts(name, empty=reason or "it was not converted")
     store = open_store(root / "clips", hands)
-    quarantine = [{key: str(record[key]) for key in store.quarantine} for record in store.quarantine.to_dict("records")]
+    quarantine = [tuple(map(str, row)) for row in store.quarantine.itertuples(index=False)]
     if not len(store):
         empty = reason or "no sequence gave a clip"
         return DatasetFacts(name, empty=empty, quarantine=quarantine, info=store.info)
@@ -68,8 +70,7 @@ def has_tables(root: Path, *tables: str) -> bool:
 
 
 def _tiles(store: Store, annotated: AnnotatedStore | None) -> list[tuple[str, str]]:
-    rows = store.sequences
-    frames = sum(int(count) for count in rows["n_frames"])
+    rows, frames = store.sequences, sum(store.sequences["n_frames"].tolist())
     tiles = [
         (f"{len(rows):,}", "clips"),
         (f"{frames:,}", "frames at 30 fps"),
@@ -102,19 +103,23 @@ def majority_verb(annotated: AnnotatedStore) -> list[tuple[str, str]]:
 
 
 def _counts(store: Store, annotated: AnnotatedStore | None) -> list[tuple[str, list[tuple[str, int]]]]:
-    rows = store.sequences
     tables = []
     if annotated is not None:
-        tables.append(("hands", _frequent(list(annotated.hand_types["hand_type"]), "none is active")))
+        tables.append(("hands", _frequent(annotated.hand_types["hand_type"], "none is active")))
         tables.append(("split", _frequent([annotated.splits[clip_id] for clip_id in annotated.ids()], "none")))
-    tables.append(("verb", _frequent(list(rows["verb"]), "no label in the source")))
-    tables.append(("object", _frequent(list(rows["object_words"]), "unnamed")))
+    tables.append(("verb", _frequent(store.sequences["verb"], UNLABELLED)))
+    tables.append(("object", _frequent(store.sequences["object_words"], "unnamed")))
     return tables
 
 
-def _frequent(column: list, missing: str) -> list[tuple[str, int]]:
+def count_values(column: Iterable, missing: str) -> list[tuple[str, int]]:
+    """(value, count), most frequent first, ties in alphabetical order."""
     names = [missing if pd.isna(value) else str(value) for value in column]
-    counted = sorted(Counter(names).items(), key=lambda item: (-item[1], item[0]))
+    return sorted(Counter(names).items(), key=lambda item: (-item[1], item[0]))
+
+
+def _frequent(column: Iterable, missing: str) -> list[tuple[str, int]]:
+    counted = count_values(column, missing)
     rest = counted[MOST_FREQUENT:]
     tail = [(f"{len(rest)} others", sum(count for _, count in rest))] if rest else []
     return counted[:MOST_FREQUENT] + tail

@@ -1,13 +1,11 @@
 """The page of one dataset: counts, lengths, examples, splits, quality control, skipped sequences, provenance."""
 
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -16,11 +14,11 @@ from hoidata.clips.clip import FPS, SIDES
 from hoidata.errors import MissingResource
 from hoidata.files.written import read_table
 from hoidata.hands import HandPair
-from hoidata.store.annotated import AnnotatedStore, load_annotated
-from pipelines.commands.store_facts import fact_rows
+from hoidata.store.annotated import SUBSETS, AnnotatedStore, load_annotated
+from pipelines.commands.store_facts import Rows, fact_rows
 from pipelines.pages.clip_page import page_name, write_clip_page
 from pipelines.pages.curves import COLOURS, figure_svg
-from pipelines.pages.dataset_facts import has_tables, read_dataset
+from pipelines.pages.dataset_facts import UNLABELLED, count_values, read_dataset
 from pipelines.pages.examples import true_contact
 from pipelines.pages.player import Player, motion_player, write_page
 from pipelines.pages.quality import read_quality
@@ -29,36 +27,14 @@ EXAMPLES = 6
 SHOWN_BARS = 24
 CLIP_FOLDER = "clips"
 NOT_MEASURED = "not measured"
-UNLABELLED = "no label in the source"
-Rows = list[tuple[str, ...]]
 
 
-@dataclass(frozen=True)
-class Bar:
-    """One bar of a chart of clip counts."""
-
-    name: str
-    clips: int
-    width: float  # percent of the longest bar
-
-
-@dataclass(frozen=True)
-class Bars:
+class Bars(NamedTuple):
     """A chart of clip counts, most clips first."""
 
     title: str
-    bars: list[Bar]
-    rest: str = ""  # the values without a bar, in words
-
-
-@dataclass(frozen=True)
-class Example:
-    """One clip as a still image, with a link to its page."""
-
-    still: Player
-    sentence: str
-    clip_id: str
-    link: str
+    bars: list[tuple[str, int, float]]  # (value, clips, percent of the longest bar)
+    rest: str  # the values without a bar, in words
 
 
 class ObjectContact(NamedTuple):
@@ -77,16 +53,13 @@ def write_dataset_page(
 ) -> Path:
     """Write ``out/<name>.html`` and, for its examples, ``out/clips/<clip>.html``; equal inputs give equal bytes.
 
-    Args:
-        root: the folder with the outputs of the dataset's stages.
-
-    Raises:
-        MissingResource: the dataset has no clips, or a stage has not run; the message says which.
+    ``root`` has the outputs of the dataset's stages. Raises MissingResource if it has no clips or a stage has not run.
     """
     facts = read_dataset(root, name, hands)
     if facts.empty:
         raise MissingResource(f"{name} has no clips to show: {facts.empty}")
     annotated = load_annotated(root, hands)
+    seconds = annotated.store.sequences["n_frames"].to_numpy() / FPS
     return write_page(
         Path(out) / f"{name}.html",
         "dataset_page.html",
@@ -94,8 +67,8 @@ def write_dataset_page(
         facts=facts,
         synthetic=facts.synthetic,
         charts=count_charts(annotated),
-        lengths=Markup(lengths_svg(annotated, f"{name} lengths")),
-        length_words=length_words(annotated),
+        lengths=Markup(lengths_svg(seconds, f"{name} lengths")),
+        length_words="Shortest {:.2f} s, median {:.2f} s, longest {:.2f} s.".format(*np.quantile(seconds, (0, 0.5, 1))),
         examples=_examples(out, annotated, hands, examples),
         splits=split_rows(annotated),
         quality=read_quality(root / "quality", name),
@@ -107,44 +80,30 @@ def write_dataset_page(
     )
 
 
-def can_be_shown(root: Path) -> bool:
-    """Whether the stages have written all files that the page of a dataset and those of its clips need."""
-    return has_tables(root, "quality/clips.parquet")
-
-
 def count_charts(annotated: AnnotatedStore) -> list[Bars]:
     """Clips by hand type, part of the chosen split, verb, object and subject."""
     rows = annotated.store.sequences
     chosen = annotated.split_info["chosen"]["name"]
     return [
-        count_bars("hand type", annotated.hand_types["hand_type"].tolist(), "none is active"),
-        count_bars(f"part of the split {chosen}", list(annotated.splits.values()), "none"),
-        count_bars("verb", rows["verb"].tolist(), UNLABELLED),
-        count_bars("object", rows["object_words"].tolist(), "unnamed"),
-        count_bars("subject", rows["subject"].tolist(), "unnamed"),
+        count_bars("hand type", annotated.hand_types["hand_type"], "none is active"),
+        count_bars(f"part of the split {chosen}", annotated.splits.values(), "none"),
+        count_bars("verb", rows["verb"], UNLABELLED),
+        count_bars("object", rows["object_words"], "unnamed"),
+        count_bars("subject", rows["subject"], "unnamed"),
     ]
 
 
-def count_bars(title: str, column: Sequence[object], missing: str) -> Bars:
-    """The number of clips per value, most frequent first, ties in alphabetical order; at most 24 bars."""
-    names = [missing if pd.isna(value) else str(value) for value in column]  # pyright: ignore[reportGeneralTypeIssues]
-    counted = sorted(Counter(names).items(), key=lambda item: (-item[1], item[0]))
+def count_bars(title: str, column: Iterable, missing: str) -> Bars:
+    """The number of clips per value; at most 24 bars."""
+    counted = count_values(column, missing)
     shown, others = counted[:SHOWN_BARS], counted[SHOWN_BARS:]
     longest = shown[0][1] if shown else 1
     rest = f"and {len(others)} others with {sum(count for _, count in others):,} clips" if others else ""
-    return Bars(title, [Bar(name, count, round(100 * count / longest, 2)) for name, count in shown], rest)
+    return Bars(title, [(name, count, round(100 * count / longest, 2)) for name, count in shown], rest)
 
 
-def length_words(annotated: AnnotatedStore) -> str:
-    """Shortest, median and longest clip in words."""
-    frames = annotated.store.sequences["n_frames"].to_numpy()
-    seconds = [value / FPS for value in (frames.min(), np.median(frames), frames.max())]
-    return "Shortest {:.2f} s, median {:.2f} s, longest {:.2f} s.".format(*seconds)
-
-
-def lengths_svg(annotated: AnnotatedStore, salt: str) -> str:
-    """A histogram of the clips' lengths in seconds."""
-    seconds = annotated.store.sequences["n_frames"].to_numpy() / FPS
+def lengths_svg(seconds: np.ndarray, salt: str) -> str:
+    """A histogram of the clips' lengths (clip,) in seconds."""
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
@@ -171,20 +130,21 @@ def example_ids(annotated: AnnotatedStore, count: int) -> list[str]:
     shown: set[tuple] = set()
     chosen: list[str] = []
     while kinds and len(chosen) < count:
-        best = max(kinds, key=lambda clip_id: len(kinds[clip_id] - shown))
-        shown |= kinds.pop(best)
-        chosen.append(best)
+        chosen.append(max(kinds, key=lambda clip_id: len(kinds[clip_id] - shown)))
+        shown |= kinds.pop(chosen[-1])
     return chosen
 
 
-def _examples(out: str | Path, annotated: AnnotatedStore, hands: HandPair, count: int) -> list[Example]:
-    """Stills of the examples; writes the page of each."""
+def _examples(
+    out: str | Path, annotated: AnnotatedStore, hands: HandPair, count: int
+) -> list[tuple[Player, str, str, str]]:
+    """(still, sentence, clip, link) of each example; writes their pages."""
     examples = []
     for clip_id in example_ids(annotated, count):
         link = f"{CLIP_FOLDER}/{page_name(clip_id)}"
         write_clip_page(Path(out) / link, annotated, clip_id, hands)
         sentence = annotated.sentences(clip_id)[0]
-        examples.append(Example(still_of(annotated, clip_id, hands, sentence), sentence, clip_id, link))
+        examples.append((still_of(annotated, clip_id, hands, sentence), sentence, clip_id, link))
     return examples
 
 
@@ -210,21 +170,18 @@ def split_rows(annotated: AnnotatedStore) -> Rows:
     chosen = info["chosen"]["name"]
     records = {f"{chosen} (chosen)": info["chosen"]}
     records |= {name: record for name, record in info["splits"].items() if name != chosen}
-    return [
-        (
-            name,
-            *(f"{record['clips'][part]:,}" for part in ("train", "validation", "test", "left_out")),
-            "yes" if record["keeps_its_promises"] else "no",
-        )
-        for name, record in records.items()
-    ]
+    rows = []
+    for name, record in records.items():
+        counts = (f"{record['clips'][part]:,}" for part in (*SUBSETS, "left_out"))
+        rows.append((name, *counts, "yes" if record["keeps_its_promises"] else "no"))
+    return rows
 
 
 def clips_without_sentences(annotated: AnnotatedStore) -> Rows:
     """(clip, reason) of every clip without sentences."""
+    rows = annotated.hand_types[["clip_id", "reason"]].itertuples(index=False)
     described = set(annotated.ids())
-    reasons = zip(annotated.hand_types["clip_id"].tolist(), annotated.hand_types["reason"].tolist(), strict=True)
-    return [(str(clip_id), str(reason)) for clip_id, reason in reasons if clip_id not in described]
+    return [(str(clip_id), str(reason)) for clip_id, reason in rows if clip_id not in described]
 
 
 def contact_by_object(annotated: AnnotatedStore) -> list[ObjectContact]:
@@ -232,21 +189,17 @@ def contact_by_object(annotated: AnnotatedStore) -> list[ObjectContact]:
     clips = annotated.store.sequences[["clip_id", "object", "n_frames"]].reset_index(drop=True)
     clips["touching"] = [len(np.unique(annotated.distances(clip_id).frame)) for clip_id in clips["clip_id"]]
     measures = ["clip_id", "penetration_m", "penetration_share"]
-    depths = read_table(Path(annotated.root) / "quality" / "clips.parquet", measures)
+    depths = read_table(annotated.root / "quality" / "clips.parquet", measures)
     clips = clips.merge(depths, on="clip_id", how="left", validate="one_to_one")
     objects = [_contact_row(str(name), group) for name, group in clips.groupby("object")]
     return [_contact_row("all objects", clips), *objects] if len(objects) > 1 else objects
 
 
 def _contact_row(name: str, rows) -> ObjectContact:
-    measured = rows[rows["penetration_m"].notna()]
-    return ObjectContact(
-        name=name,
-        clips=f"{len(rows):,}",
-        frames=f"{rows['n_frames'].sum():,}",
-        touching=f"{100 * rows['touching'].sum() / rows['n_frames'].sum():.1f} %",
-        deep=f"{100 * np.average(measured['penetration_share'], weights=measured['n_frames']):.1f} %"
-        if len(measured)
-        else NOT_MEASURED,
-        deepest=f"{measured['penetration_m'].max() * 1000:.1f}" if len(measured) else NOT_MEASURED,
-    )
+    measured, frames = rows[rows["penetration_m"].notna()], rows["n_frames"].sum()
+    deep = deepest = NOT_MEASURED
+    if len(measured):
+        deep = f"{100 * np.average(measured['penetration_share'], weights=measured['n_frames']):.1f} %"
+        deepest = f"{measured['penetration_m'].max() * 1000:.1f}"
+    touching = f"{100 * rows['touching'].sum() / frames:.1f} %"
+    return ObjectContact(name, f"{len(rows):,}", f"{frames:,}", touching, deep, deepest)

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hoidata.clips.clip import SIDES, Clip, Side
-from hoidata.contact.maps import contact_maps, distance_entries
+from hoidata.clips.clip import Clip
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import HandPair, track_joints
+from hoidata.objects.sampling import SampledPoints
 from hoidata.store.annotated import SUBSETS, AnnotatedStore
 from hoidata.store.store import open_store
 from pipelines.pages.surface import ContactPaint
@@ -42,11 +42,18 @@ def first_motion(samples: Path, clip_id: str, hands: HandPair) -> Clip | None:
     return store.clip(name) if name in store.sequences.index else None
 
 
+def touched_points(clip: Clip, hands: HandPair, points: SampledPoints, threshold_m: float) -> np.ndarray:
+    """(point,) bool: closer than the threshold to a joint of a hand in any valid frame, as in the contact stage."""
+    index, touched = ProximityIndex(points), np.zeros(len(points), dtype=bool)
+    for side, track in clip.hands.items():
+        if track.valid.any():
+            entries = index.entries(track_joints(track, hands[side]), track.valid, clip.object, threshold_m)
+            touched[entries["point"]] = True
+    return touched
+
+
 def motion_contact(annotated: AnnotatedStore, clip_id: str, motion: Clip, hands: HandPair) -> ContactPaint:
-    """Points that any hand of ``motion`` touches in any frame, by the rule of the contact stage."""
+    """The ``touched_points`` of ``motion`` at the contact threshold of the dataset."""
     points = annotated.points(annotated.object_key(clip_id))
-    index = ProximityIndex(points)
-    joints: dict[Side, np.ndarray] = {side: track_joints(motion.hands[side], hands[side]) for side in SIDES}
-    threshold_m = annotated.contact_threshold_m
-    maps = contact_maps(distance_entries(motion, joints, index, threshold_m), len(points.points_m))
-    return ContactPaint(points.points_m, points.part, np.maximum(*maps.values()).astype(np.float64))
+    touched = touched_points(motion, hands, points, annotated.contact_threshold_m)
+    return ContactPaint(points.points_m, points.part, touched.astype(np.float64))

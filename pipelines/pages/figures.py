@@ -237,9 +237,8 @@ def _refined(subject: Subject) -> Figure:
             results = evaluate_store(out / "clips", data, hands, metrics=REFINER_METRICS)
             rows.append((title, *(_cell(results, one.name) for one in REFINER_METRICS)))
             panels += subject.sampled_panel(family, out)
-    words = (
-        f"The refiner network on perturbed recordings; means and 95 % intervals of up to {REFINED_CLIPS} test clips."
-    )
+    measured = f"means and 95 % intervals of up to {REFINED_CLIPS} test clips"
+    words = f"The refiner network on perturbed recordings; {measured}."
     head = ("motion", *(f"{one.title}, {one.unit}" if one.unit else one.title for one in REFINER_METRICS))
     return Figure("refiner", "Fig. S6", "The refiner on perturbed recordings", words, _same_camera(panels), head, rows)
 
@@ -256,10 +255,8 @@ def _frames(subject: Subject) -> Figure:
     clip = subject.generate(subject.prompt)[0].clip
     # Relative to the first frame, so that the object stands as it does there.
     object_frame = clip.object.world_from_object[:1] @ clip.object.world_from_object.inverse()
-    panels = [
-        subject.panel("in the world", clip),
-        subject.panel("in the object's frame", seen_from(clip, object_frame)),
-    ]
+    in_object_frame = subject.panel("in the object's frame", seen_from(clip, object_frame))
+    panels = [subject.panel("in the world", clip), in_object_frame]
     without_up = replace(clip, gravity=None)
     for side, track in clip.hands.items():
         if track.valid.any():

@@ -6,35 +6,23 @@ from typing import Any
 
 import numpy as np
 
-from hoidata.clips.clip import FPS, SIDES
+from hoidata.clips.clip import FPS
 from hoidata.contact.maps import f1_score
-from hoidata.contact.proximity import ProximityIndex
 from hoidata.files.atomic import canonical_json
-from hoidata.hands import HandPair, track_joints
+from hoidata.hands import HandPair
 from hoidata.metrics.verdict import summary
 from models.common.checkpoints import FILE_NAME
 from models.text2hoi.generation import GeneratedMotion
-from pipelines.pages.motion_files import ARRAYS as SHARED
-from pipelines.pages.motion_files import (
-    MotionFiles,
-    clip_joints_m,
-    mesh_arrays,
-    motion_arrays,
-    simplified_for_page,
-    write_motions,
-)
+from pipelines.pages import motion_files
+from pipelines.pages.examples import touched_points
+from pipelines.pages.motion_files import MotionFiles, simplified_for_page
 from pipelines.pages.player import contact_player, motion_player
 from pipelines.pages.surface import ContactPaint
 
 # Every array of motion.npz. Axes: S = 2 sides (left, right), F frames, P object points.
-ARRAYS = {
+ARRAYS = motion_files.GENERATED_ARRAYS | {
     "text": "the sentence",
-    "checkpoints": "JSON: SHA-256 of each network's file by its path; `hoidata lineage motion.npz` reads it",
-    "seed": "the random seed of the motion",
-    **SHARED,
     "coarse_joints_m": "(S, F, 21, 3) the joints before refinement",
-    "contact_points_m": "(P, 3) points of the object, in its frame",
-    "contact_part": "(P,) 1 where the hinge moves the point",
     "contact": "(P,) the target contact map of the motion",
 }
 REFINED_BY = {"contact": "contact refinement by optimisation", "network": "the refiner network", "none": "nothing"}
@@ -47,20 +35,15 @@ def write_generation(
     checkpoints: str,
     notes: Sequence[str] = (),
 ) -> list[Path]:
-    """Write motion.npz, motion.glb (further motions: motion-1.npz, ...) and index.html; returns their paths.
-
-    The same motions give the same bytes.
-
-    Args:
-        checkpoints: the folder of the checkpoints, in words.
-    """
+    """Write the files of ``write_motions``; returns their paths. ``checkpoints``: their folder, in words."""
     files = []
     for motion in motions:
-        made_from = checkpoint_digests(motion, checkpoints)
+        digests = sorted(motion.evidence["checkpoints"].items())
+        made_from = {f"{checkpoints}/{name}/{FILE_NAME}": digest for name, digest in digests}
         arrays, paint = generated_arrays(motion, hands, made_from), _paint(motion, motion.contact)
         number = motion.evidence["number"]
         files.append(MotionFiles(motion.clip, arrays, paint, checkpoints=made_from, number=number))
-    return write_motions(
+    return motion_files.write_motions(
         Path(out_dir),
         "generation.html",
         files,
@@ -69,17 +52,21 @@ def write_generation(
         "the target contact",
         title=str(motions[0].evidence["text"]),
         notes=list(notes),
-        verdicts=[
-            (f"sample {motion.evidence['number'] + 1}", summary(motion.verdict), motion.verdict) for motion in motions
-        ],
-        motions=[shown_motion(motion, hands, f"sample {motion.evidence['number'] + 1}") for motion in motions],
+        verdicts=[(_sample(motion), summary(motion.verdict), motion.verdict) for motion in motions],
+        motions=[shown_motion(motion, hands, _sample(motion)) for motion in motions],
         facts=[*generation_facts(motions, checkpoints), ("hand model", hands.name)],
     )
 
 
+def _sample(motion: GeneratedMotion) -> str:
+    return f"sample {motion.evidence['number'] + 1}"
+
+
 def shown_motion(motion: GeneratedMotion, hands: HandPair, caption: str) -> dict[str, Any]:
     """The content of the page for one motion. Large meshes are simplified on the page only."""
-    text, reached = str(motion.evidence["text"]), reached_contact(motion, hands)
+    text, threshold_m = str(motion.evidence["text"]), motion.evidence["contact_threshold_m"]
+    reached = touched_points(motion.clip, hands, motion.points, threshold_m)
+    both = (motion.contact & reached).sum()
     clip, coarse = (simplified_for_page(shown) for shown in (motion.clip, motion.coarse))
     title = f"{caption}: {text}"
     paints = {"target": _paint(motion, motion.contact), "generated": _paint(motion, reached)}
@@ -91,27 +78,9 @@ def shown_motion(motion: GeneratedMotion, hands: HandPair, caption: str) -> dict
             contact_player(clip, paint, f"{title}, {name}", name, name, paints["target"])
             for name, paint in paints.items()
         ],
-        "agreement": _agreement(motion.contact, reached),
+        "agreement": f"{motion.contact.sum()} target points, {reached.sum()} touched points, {both} in both "
+        f"(F1 {f1_score(motion.contact, reached):.2f})",
     }
-
-
-def _agreement(target: np.ndarray, generated: np.ndarray) -> str:
-    """The agreement of two contact maps (point,), in words."""
-    both, f1 = int((target & generated).sum()), f1_score(target, generated)
-    return f"{target.sum()} target points, {generated.sum()} touched points, {both} in both (F1 {f1:.2f})"
-
-
-def reached_contact(motion: GeneratedMotion, hands: HandPair) -> np.ndarray:
-    """(P,) bool: points within the training data's contact threshold of a joint of an acting hand in any frame."""
-    clip, index = motion.clip, ProximityIndex(motion.points)
-    reached = np.zeros(len(motion.points.points_m), dtype=bool)
-    for side in SIDES:
-        track = clip.hands[side]
-        if track.valid.any():
-            joints = track_joints(track, hands[side])
-            near = index.entries(joints, track.valid, clip.object, motion.evidence["contact_threshold_m"])
-            reached[near["point"]] = True
-    return reached
 
 
 def _paint(motion: GeneratedMotion, contact: np.ndarray) -> ContactPaint:
@@ -126,23 +95,17 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
     clips = ", ".join(f"{count} {kind} {name} clips" for name, count in evidence["trained_on"].items())
     lengths = [f"{shown.clip.n_frames} frames, {shown.clip.n_frames / FPS:.2f} s at {FPS} fps" for shown in motions]
     digests = ", ".join(f"{name} {digest[:12]}" for name, digest in evidence["checkpoints"].items())
-    resampled = [
-        f"sample {shown.evidence['number'] + 1}: the best of {shown.evidence['attempts']} motions; the others did not "
-        "carry the object or moved unlike the verb"
-        for shown in motions
-        if shown.evidence["attempts"] > 1
-    ]
+    attempts = {_sample(shown): count for shown in motions if (count := shown.evidence["attempts"]) > 1}
+    others = "motions; the others did not carry the object or moved unlike the verb"
+    resampled = [f"{sample}: the best of {count} {others}" for sample, count in attempts.items()]
+    compared = [f"{_sample(shown)}: {words}" for shown in motions if (words := _compared(shown))]
     return [
         ("hands", f"{hand['hand']} (decided by {hand['source']}: {hand['evidence']})"),
         ("length", "; ".join(lengths)),
         ("object", clip.object_words),
         *([("verb of the prompt", verb)] if verb else []),
         ("seed", str(evidence["seed"])),
-        *[
-            ("compared with training", f"sample {shown.evidence['number'] + 1}: {words}")
-            for shown in motions
-            if (words := _compared(shown))
-        ],
+        *[("compared with training", words) for words in compared],
         *([("rejection sampling", "; ".join(resampled))] if resampled else []),
         ("trained on", clips),
         ("refined by", REFINED_BY[evidence["refine"]]),
@@ -158,21 +121,15 @@ def _compared(motion: GeneratedMotion) -> str:
     return ", ".join([*([f"motion classified as {nearest_verb!r}"] if is_other else []), *motion.evidence["unusual"]])
 
 
-def checkpoint_digests(motion: GeneratedMotion, folder: str) -> dict[str, str]:
-    """SHA-256 of the checkpoints that generated a motion, by path below ``folder``."""
-    names = motion.evidence["checkpoints"]
-    return {f"{folder}/{name}/{FILE_NAME}": digest for name, digest in sorted(names.items())}
-
-
 def generated_arrays(motion: GeneratedMotion, hands: HandPair, digests: dict[str, str]) -> dict[str, np.ndarray]:
-    """The arrays of motion.npz (``ARRAYS``); ``digests`` as in ``checkpoint_digests``."""
+    """The arrays of motion.npz (``ARRAYS``); ``digests``: SHA-256 of the networks' checkpoints by path."""
     return {
         "text": np.array(str(motion.evidence["text"])),
         "checkpoints": np.array(canonical_json(digests)),
         "seed": np.array(motion.evidence["seed"]),
-        **motion_arrays(motion.clip, hands),
-        **mesh_arrays(motion.clip.object.model),
-        "coarse_joints_m": clip_joints_m(motion.coarse, hands),
+        **motion_files.motion_arrays(motion.clip, hands),
+        **motion_files.mesh_arrays(motion.clip.object.model),
+        "coarse_joints_m": motion_files.clip_joints_m(motion.coarse, hands),
         "contact_points_m": motion.points.points_m,
         "contact_part": motion.points.part,
         "contact": np.asarray(motion.contact, dtype=bool),

@@ -7,7 +7,6 @@ to zero in invalid frames. The node "world" rotates gravity to glTF's -y.
 """
 
 from collections.abc import Mapping
-from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
@@ -15,12 +14,12 @@ import pygltflib as gltf
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
-from hoidata.files import write_whole
 from hoidata.hands import JOINT_NAMES, HandModel, HandPair
 from hoidata.hands.embedded import vertex_normals
 from hoidata.objects.model import ObjectModel
 from pipelines.pages.surface import ContactPaint, Surface, display_surface
 
+Colour = tuple[float, float, float]
 _TYPES = {1: gltf.SCALAR, 3: gltf.VEC3, 4: gltf.VEC4, 16: gltf.MAT4}
 _COMPONENTS = {"float32": gltf.FLOAT, "uint8": gltf.UNSIGNED_BYTE, "uint32": gltf.UNSIGNED_INT}
 HAND_COLOURS = {"left": (0.47, 0.62, 0.78), "right": (0.90, 0.69, 0.53)}
@@ -75,42 +74,33 @@ class GltfBuilder:
         siblings.append(index)
         return index
 
-    def material(
-        self, name: str, colour: tuple[float, float, float], roughness: float = 0.75, opacity: float = 1.0
+    def mesh(
+        self, name: str, attributes: dict[str, int], faces: np.ndarray, colour: Colour, opacity: float = 1.0
     ) -> int:
-        """Matt material; colour as sRGB numbers in [0, 1]."""
-        surface = gltf.PbrMetallicRoughness(
-            baseColorFactor=[*linear_from_srgb(np.array(colour)).round(5).tolist(), opacity],
-            metallicFactor=0.0,
-            roughnessFactor=roughness,
-        )
+        """Add a mesh with faces (face, 3) and a matt material of its name; colour as sRGB numbers in [0, 1]."""
+        indices = self.array(faces.reshape(-1).astype(np.uint32), gltf.ELEMENT_ARRAY_BUFFER)
+        factor = [*linear_from_srgb(np.array(colour)).round(5).tolist(), opacity]
+        surface = gltf.PbrMetallicRoughness(baseColorFactor=factor, metallicFactor=0.0, roughnessFactor=0.75)
         material = gltf.Material(name=name, pbrMetallicRoughness=surface, alphaCutoff=None)
         if opacity < 1:
             material.alphaMode = gltf.BLEND
         self.document.materials.append(material)
-        return len(self.document.materials) - 1
-
-    def mesh(self, name: str, attributes: dict[str, int], indices: int, material: int) -> int:
-        primitive = gltf.Primitive(attributes=gltf.Attributes(**attributes), indices=indices, material=material)
+        number = len(self.document.materials) - 1
+        primitive = gltf.Primitive(attributes=gltf.Attributes(**attributes), indices=indices, material=number)
         self.document.meshes.append(gltf.Mesh(name=name, primitives=[primitive]))
         return len(self.document.meshes) - 1
 
     def skin(self, name: str, joints: list[int], inverse_bind: np.ndarray) -> int:
         """Add a skin; inverse_bind: (joint, 4, 4) acting on column vectors (glTF stores them column by column)."""
-        matrices = inverse_bind.transpose(0, 2, 1).reshape(-1, 16).astype(np.float32)
-        self.document.skins.append(
-            gltf.Skin(name=name, joints=joints, skeleton=joints[0], inverseBindMatrices=self.array(matrices))
-        )
+        matrices = self.array(inverse_bind.transpose(0, 2, 1).reshape(-1, 16).astype(np.float32))
+        skin = gltf.Skin(name=name, joints=joints, skeleton=joints[0], inverseBindMatrices=matrices)
+        self.document.skins.append(skin)
         return len(self.document.skins) - 1
 
     def animate(self, node: int, path: str, times: int, values: np.ndarray, step: bool = False) -> None:
         """Animate one property ("translation", "rotation" as xyzw, "scale") of a node; times: accessor of seconds."""
-        sampler = gltf.AnimationSampler(
-            input=times,
-            output=self.array(values.astype(np.float32)),
-            interpolation=gltf.ANIM_STEP if step else gltf.ANIM_LINEAR,
-        )
-        self._animation.samplers.append(sampler)
+        output, kind = self.array(values.astype(np.float32)), gltf.ANIM_STEP if step else gltf.ANIM_LINEAR
+        self._animation.samplers.append(gltf.AnimationSampler(input=times, output=output, interpolation=kind))
         target = gltf.AnimationChannelTarget(node=node, path=path)
         self._animation.channels.append(gltf.AnimationChannel(sampler=len(self._animation.samplers) - 1, target=target))
 
@@ -123,22 +113,6 @@ class GltfBuilder:
         return b"".join(self.document.save_to_bytes())
 
 
-def write_glb(
-    path: str | Path,
-    clip: Clip,
-    hands: HandPair,
-    contact: ContactPaint | None = None,
-    ghosts: Mapping[Side, HandTrack] = MappingProxyType({}),
-    extras: dict | None = None,
-) -> Path:
-    """Write ``clip`` as an animated, self-contained GLB; equal inputs give equal bytes.
-
-    Args:
-        ghosts: transparent hands, for comparison with those of the clip.
-    """
-    return write_whole(path, glb_bytes(clip, hands, contact, ghosts, extras))
-
-
 def glb_bytes(
     clip: Clip,
     hands: HandPair | None,
@@ -147,10 +121,11 @@ def glb_bytes(
     extras: dict | None = None,
     markers: Mapping[Side, np.ndarray] = MappingProxyType({}),
 ) -> bytes:
-    """The bytes of ``write_glb``.
+    """``clip`` as an animated, self-contained GLB; equal inputs give equal bytes.
 
     Args:
         hands: None for the objects alone.
+        ghosts: transparent hands, for comparison with those of the clip.
         markers: per side (frame, 21, 3) world joints, metres, added as empty nodes ``<side> joint <name>``.
     """
     facts = {"clip": clip.clip_id, "synthetic": clip.synthetic, "fps": FPS}
@@ -165,7 +140,7 @@ def glb_bytes(
             _add_hand(builder, world, times, hands[side], clip.hands[side])
     for side, track in ghosts.items():
         if hands is not None and track.valid.any():
-            _add_hand(builder, world, times, hands[side], track, "recorded ", GHOST_COLOUR, GHOST_OPACITY)
+            _add_hand(builder, world, times, hands[side], track, is_ghost=True)
     for side, joints_m in markers.items():
         for number, name in enumerate(JOINT_NAMES):
             builder.animate(builder.node(f"{side} joint {name}", world), "translation", times, joints_m[:, number])
@@ -208,16 +183,10 @@ def strongest_weights(skin_weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _add_hand(
-    builder: GltfBuilder,
-    world: int,
-    times: int,
-    model: HandModel,
-    track: HandTrack,
-    prefix: str = "",
-    colour: tuple[float, float, float] | None = None,
-    opacity: float = 1.0,
+    builder: GltfBuilder, world: int, times: int, model: HandModel, track: HandTrack, is_ghost: bool = False
 ) -> None:
-    name = f"{prefix}{model.side}"
+    name = f"{'recorded ' * is_ghost}{model.side}"
+    colour, opacity = (GHOST_COLOUR, GHOST_OPACITY) if is_ghost else (HAND_COLOURS[model.side], 1.0)
     vertices, rest_joints = rest_hand(model, track)
     nodes = _add_skeleton(builder, world, model, rest_joints, name)
     inverse_bind = np.tile(np.eye(4), (16, 1, 1))
@@ -230,9 +199,7 @@ def _add_hand(
         "JOINTS_0": builder.array(joints, gltf.ARRAY_BUFFER),
         "WEIGHTS_0": builder.array(weights, gltf.ARRAY_BUFFER),
     }
-    indices = builder.array(faces.reshape(-1).astype(np.uint32), gltf.ELEMENT_ARRAY_BUFFER)
-    material = builder.material(f"{name} hand", colour or HAND_COLOURS[model.side], opacity=opacity)
-    mesh = builder.mesh(f"{name} hand", attributes, indices, material)
+    mesh = builder.mesh(f"{name} hand", attributes, faces, colour, opacity)
     builder.node(f"{name} hand", None, mesh=mesh, skin=skin)
     _animate_hand(builder, times, nodes, track)
 
@@ -240,11 +207,11 @@ def _add_hand(
 def _add_skeleton(
     builder: GltfBuilder, world: int, model: HandModel, rest_joints: np.ndarray, hand_name: str
 ) -> list[int]:
+    offsets = np.concatenate([rest_joints[:1], rest_joints[1:] - rest_joints[model.parents[1:]]]).astype(np.float32)
     nodes: list[int] = []
     for joint, name in enumerate(JOINT_NAMES[:16]):
-        parent = world if joint == 0 else nodes[int(model.parents[joint])]
-        offset = rest_joints[joint] if joint == 0 else rest_joints[joint] - rest_joints[int(model.parents[joint])]
-        nodes.append(builder.node(f"{hand_name} {name}", parent, translation=np.float32(offset).tolist()))
+        parent = nodes[model.parents[joint]] if joint else world
+        nodes.append(builder.node(f"{hand_name} {name}", parent, translation=offsets[joint].tolist()))
     return nodes
 
 
@@ -261,12 +228,12 @@ def _animate_hand(builder: GltfBuilder, times: int, nodes: list[int], track: Han
 def _add_object(
     builder: GltfBuilder, world: int, times: int, name: str, track: ObjectTrack, contact: ContactPaint | None
 ) -> None:
-    model, other = track.model, name != "object"
+    model = track.model
+    colours = (OBJECT_COLOUR, MOVING_PART_COLOUR) if name == "object" else (OTHER_OBJECT_COLOUR, OTHER_OBJECT_COLOUR)
     node = builder.node(name, world)
     builder.animate(node, "translation", times, track.translation_m)
     builder.animate(node, "rotation", times, continuous_quaternions(track.rotvec))
-    base_colour = OTHER_OBJECT_COLOUR if other else OBJECT_COLOUR
-    _add_part(builder, node, model, model.faces_of(0), 0, base_colour, contact)
+    _add_part(builder, node, model, 0, colours[0], contact)
     if model.hinge is None or track.hinge_rad is None:
         return
     part = builder.node(f"{name} moving part", node, translation=np.float32(model.hinge.origin_m).tolist())
@@ -275,30 +242,25 @@ def _add_object(
         builder.animate(part, "translation", times, positions_m.astype(np.float32))
     else:
         builder.animate(part, "rotation", times, continuous_quaternions(angles))
-    colour = OTHER_OBJECT_COLOUR if other else MOVING_PART_COLOUR
-    _add_part(builder, part, model, model.faces_of(1), 1, colour, contact)
+    _add_part(builder, part, model, 1, colours[1], contact)
 
 
 def _add_part(
-    builder: GltfBuilder,
-    parent: int,
-    model: ObjectModel,
-    faces: np.ndarray,
-    part: int,
-    colour: tuple[float, float, float],
-    contact: ContactPaint | None,
+    builder: GltfBuilder, parent: int, model: ObjectModel, part: int, colour: Colour, contact: ContactPaint | None
 ) -> None:
     """Attach one rigid part of the object to its node; vertices of the moving part are relative to the hinge origin."""
-    if len(faces) == 0:
+    vertices_m, faces = model.part_mesh(part)
+    if not len(faces):
         return
-    used, compact = np.unique(faces, return_inverse=True)
-    surface = display_surface(model.vertices_m[used], compact.reshape(-1, 3), _paint_of_part(contact, part))
+    if contact is not None:
+        here = np.asarray(contact.part) == part
+        contact = ContactPaint(contact.points_m[here], contact.part[here], contact.value[here])
+    surface = display_surface(vertices_m, faces, contact)
     origin = model.hinge.origin_m if part == 1 and model.hinge is not None else np.zeros(3)
     attributes = _surface_attributes(builder, surface, origin)
-    indices = builder.array(surface.faces.reshape(-1).astype(np.uint32), gltf.ELEMENT_ARRAY_BUFFER)
     # A painted surface carries its colour per vertex; the material then only says how it shines.
-    material = builder.material(f"{model.name} {part}", colour if surface.value is None else (1.0, 1.0, 1.0))
-    mesh = builder.mesh(f"{model.name} {part}", attributes, indices, material)
+    colour = colour if surface.value is None else (1.0, 1.0, 1.0)
+    mesh = builder.mesh(f"{model.name} {part}", attributes, surface.faces, colour)
     builder.node(f"{model.name} {'base' if part == 0 else 'part'} mesh", parent, mesh=mesh)
 
 
@@ -310,13 +272,6 @@ def _surface_attributes(builder: GltfBuilder, surface: Surface, origin: np.ndarr
     if surface.value is not None:
         attributes["COLOR_0"] = builder.array(contact_colours(surface.value), gltf.ARRAY_BUFFER, normalized=True)
     return attributes
-
-
-def _paint_of_part(contact: ContactPaint | None, part: int) -> ContactPaint | None:
-    if contact is None:
-        return None
-    here = np.asarray(contact.part) == part
-    return ContactPaint(contact.points_m[here], contact.part[here], contact.value[here])
 
 
 def continuous_quaternions(rotvec: np.ndarray) -> np.ndarray:

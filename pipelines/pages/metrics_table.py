@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from rich import box
@@ -158,12 +159,9 @@ class _Files:
 
     def column(self, metric: AnyMetric) -> dict[str, float]:
         """The comparable values of a metric by family."""
-        values = {
-            family: content["figures"][metric.name]
-            for family, content in self.contents.items()
-            if self.has(family, metric)
-        }
-        return {family: value for family, value in values.items() if not self.is_foreign(family, metric)}
+        measured = [family for family in self.contents if self.has(family, metric)]
+        comparable = [family for family in measured if not self.is_foreign(family, metric)]
+        return {family: self.contents[family]["figures"][metric.name] for family in comparable}
 
     def has(self, family: str, metric: AnyMetric) -> bool:
         return self.contents[family].get("figures", {}).get(metric.name) is not None
@@ -172,11 +170,12 @@ class _Files:
         """Whether the value comes from other evaluator weights than the first family's, so they cannot be compared."""
         if not isinstance(metric, FeatureMetric):
             return False
-        digests = {name: self._digest(name, metric.encoder) for name in self.contents if self.has(name, metric)}
-        return digests[family] != next(iter(digests.values())) if family in digests else False
-
-    def _digest(self, family: str, encoder: str) -> str:
-        return self.contents[family].get("evaluators", {}).get(encoder, {}).get("digest", "")
+        evaluators = {
+            name: content.get("evaluators", {}).get(metric.encoder, {}).get("digest", "")
+            for name, content in self.contents.items()
+            if self.has(name, metric)
+        }
+        return family in evaluators and evaluators[family] != next(iter(evaluators.values()))
 
     def interval(self, family: str, metric: AnyMetric, kind: str) -> tuple[float, float] | None:
         ends = self.contents[family].get("intervals", {}).get(metric.name, {}).get(kind)
@@ -206,19 +205,18 @@ def metrics_tables(folder: str | Path, families: Sequence[str]) -> MetricsTable:
     shown = [metric for metric in ALL_METRICS if any(files.has(family, metric) for family in files.contents)]
     never = [metric for metric in ALL_METRICS if metric not in shown and _reasons(metric, files)]
     titles = dict.fromkeys(metric.topic for metric in ALL_METRICS if metric in shown or metric in never)
-    topics = [_topic(title, _of_topic(title, shown), _of_topic(title, never), files) for title in titles]
+    topics = []
+    for title in titles:
+        columns, missing = ([one for one in metrics if one.topic == title] for metrics in (shown, never))
+        topics.append(_topic(title, columns, missing, files))
     if any(metric.name == PAPER_COLUMNS[0] for metric in shown):
         by_name = {metric.name: metric for metric in ALL_METRICS}
         topics.insert(0, _topic(PAPER_TABLE, [by_name[name] for name in PAPER_COLUMNS], [], files))
     return MetricsTable([_method(family, files, shown) for family in files.contents], topics)
 
 
-def _of_topic(title: str, metrics: list[AnyMetric]) -> list[AnyMetric]:
-    return [metric for metric in metrics if metric.topic == title]
-
-
 def markdown_table(
-    folder: str | Path, families: Sequence[str], names: Sequence[str], stale: Mapping[str, str] | None = None
+    folder: str | Path, families: Sequence[str], names: Sequence[str], stale: Mapping[str, str] = MappingProxyType({})
 ) -> str:
     """The metrics ``names`` of every evaluated method as a Markdown table.
 
@@ -226,7 +224,6 @@ def markdown_table(
     were not evaluated and of unmeasured metrics follow below the table. Raises BadInput for an unknown metric.
     """
     files, by_name = _read_files(Path(folder), families), {metric.name: metric for metric in ALL_METRICS}
-    stale = stale or {}
     if unknown := [name for name in names if name not in by_name]:
         raise BadInput("metric", f"one of {', '.join(by_name)}", ", ".join(unknown), "correct the name")
     metrics = [by_name[name] for name in names]
@@ -269,11 +266,9 @@ def _read_files(folder: Path, families: Sequence[str]) -> _Files:
     controls = sorted(path.stem for path in (folder / CONTROLS).glob("*.json") if path.stem != "empty")
     paths = {family: folder / f"{family}.json" for family in families}
     paths |= {control: folder / CONTROLS / f"{control}.json" for control in controls if control not in paths}
-    return _Files({family: _read(path) for family, path in paths.items()}, frozenset(controls))
-
-
-def _read(path: Path) -> dict[str, Any]:
-    return read_metrics(path) if path.is_file() else {"empty": "not evaluated"}
+    absent = {"empty": "not evaluated"}
+    contents = {family: read_metrics(path) if path.is_file() else absent for family, path in paths.items()}
+    return _Files(contents, frozenset(controls))
 
 
 def _method(family: str, files: _Files, shown: list[AnyMetric]) -> Method:
@@ -289,27 +284,16 @@ def _method(family: str, files: _Files, shown: list[AnyMetric]) -> Method:
             summary.append(f"worse than {baseline} in {len(titles)} of {compared} metrics")
             worse_in.append(f"worse than {baseline}: {', '.join(titles)}")
     flat = _flat(content.get("diagnostics", {}))
+    diagnostics = [(name, NOT_MEASURED if value is None else number(value)) for name, value in flat.items()]
     skipped = len(content.get("left_out", []))
     note = f"{content['motions']:,} motions of {content['held_out_clips']:,} clips"
     note += f", {skipped:,} skipped" if skipped else ""
     note += ", of estimated length" if content.get("length") == "own" else ""
-    return Method(
-        family=family,
-        kind=kind,
-        summary="; ".join(summary),
-        worse_in=worse_in,
-        note=note,
-        diagnostics=[(name, NOT_MEASURED if value is None else number(value)) for name, value in flat.items()],
-    )
+    return Method(family, kind, "; ".join(summary), worse_in, note=note, diagnostics=diagnostics)
 
 
 def _topic(title: str, metrics: list[AnyMetric], never: list[AnyMetric], files: _Files) -> Topic:
-    """The table of one topic.
-
-    Args:
-        metrics: those with a value for some method.
-        never: those that could not be measured for any method.
-    """
+    """The table of one topic: metrics with a value for some method, and metrics ``never`` measured for any."""
     titles = defaultdict[str, list[str]](list)
     for metric in never:
         titles[_reasons(metric, files)].append(metric.title)
@@ -357,17 +341,10 @@ def _chart(metric: AnyMetric, files: _Files) -> Chart | None:
         pair = spreads[kind][family]
         return (percent(pair[0]), percent(pair[1])) if pair else None
 
-    bars = [
-        Bar(
-            family=family,
-            kind=files.kind(family),
-            at=percent(value),
-            clips=span("clips", family),
-            repetitions=span("repetitions", family),
-            text=number(value),
-        )
-        for family, value in column.items()
-    ]
+    bars = []
+    for family, value in column.items():
+        clips, repetitions = span("clips", family), span("repetitions", family)
+        bars.append(Bar(family, files.kind(family), percent(value), clips, repetitions, number(value)))
     missing = [family for family in files.contents if family not in column and files.unmeasured(family, metric)]
     return Chart(
         title=f"{metric.title}, {metric.unit}" if metric.unit else metric.title,

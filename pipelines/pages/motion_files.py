@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, Side
+from hoidata.files import write_whole
 from hoidata.files.arrays import write_npz
 from hoidata.hands import HandPair, track_joints
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import thinned
-from pipelines.pages.glb import write_glb
+from pipelines.pages.glb import glb_bytes
 from pipelines.pages.player import write_page
 from pipelines.pages.surface import ContactPaint
 
@@ -36,6 +37,13 @@ ARRAYS = {
     "object_part": "(vertex,) 1 where the hinge moves it",
     "object_hinge_axis": "(3,) direction of the hinge of an articulated object, in the object frame",
     "object_hinge_origin_m": "(3,) a point on the hinge; missing if the joint is prismatic",
+}
+# Those of motions that networks generated. P: object points.
+GENERATED_ARRAYS = ARRAYS | {
+    "checkpoints": "JSON: SHA-256 of each network's file by its path; `hoidata lineage motion.npz` reads it",
+    "seed": "the random seed of the motion",
+    "contact_points_m": "(P, 3) points of the object, in its frame",
+    "contact_part": "(P,) 1 where the hinge moves the point",
 }
 
 
@@ -62,10 +70,7 @@ def write_motions(
 ) -> list[Path]:
     """Write motion.npz, motion.glb (further motions: motion-1.npz, ...) and index.html; returns their paths.
 
-    The same motions give the same bytes.
-
-    Args:
-        colour_meaning: the meaning of the colours in the .glb.
+    The same motions give the same bytes. ``colour_meaning``: that of the colours in the .glb.
     """
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
@@ -73,18 +78,16 @@ def write_motions(
         name = f"motion-{motion.number}" if motion.number else "motion"
         extras = None if motion.checkpoints is None else {"checkpoints": dict(motion.checkpoints)}
         write_npz(folder / f"{name}.npz", motion.arrays)
-        write_glb(folder / f"{name}.glb", motion.clip, hands, motion.paint, motion.ghosts, extras)
+        glb = glb_bytes(motion.clip, hands, motion.paint, motion.ghosts, extras)
+        write_whole(folder / f"{name}.glb", glb)
         paths += [folder / f"{name}.npz", folder / f"{name}.glb"]
     words = {
         ".glb": "; coloured by ".join(filter(None, ("an animated model for any glTF 2.0 viewer", colour_meaning))),
         ".npz": "plain arrays, metres and radians: numpy.load('motion.npz')",
     }
-    values |= {
-        "files": [(path.name, words[path.suffix]) for path in paths],
-        "synthetic": motion_files[0].clip.synthetic,
-    }
-    values |= {"arrays": [(name, meanings[name]) for name in motion_files[0].arrays], "has_players": True}
-    return [*paths, write_page(folder / "index.html", template, **values)]
+    values |= {"files": [(path.name, words[path.suffix]) for path in paths], "has_players": True}
+    values |= {"arrays": [(name, meanings[name]) for name in motion_files[0].arrays]}
+    return [*paths, write_page(folder / "index.html", template, synthetic=motion_files[0].clip.synthetic, **values)]
 
 
 def motion_arrays(clip: Clip, hands: HandPair) -> dict[str, np.ndarray]:

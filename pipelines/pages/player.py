@@ -20,15 +20,7 @@ from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.files import write_whole
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, track_joints
-from pipelines.pages.glb import (
-    GHOST_COLOUR,
-    HAND_COLOURS,
-    MOVING_PART_COLOUR,
-    OBJECT_COLOUR,
-    OTHER_OBJECT_COLOUR,
-    glb_bytes,
-    upright_rotation,
-)
+from pipelines.pages import glb
 from pipelines.pages.surface import ContactPaint
 
 _FOLDER = Path(__file__).parent
@@ -81,18 +73,16 @@ def motion_player(
     contact_label: str = "",
     ghosts: Mapping[Side, HandTrack] = MappingProxyType({}),
 ) -> Player:
-    """A player of ``clip``: the valid hands and the object, coloured by ``contact``.
+    """A player of ``clip``: the valid hands and the object, coloured by ``contact`` with the meaning ``contact_label``.
 
-    Args:
-        contact_label: the meaning of the contact colours.
-        ghosts: transparent hands, those of the recording.
+    ``ghosts`` are transparent hands, those of the recording.
     """
     return Player(
-        glb=glb_bytes(clip, hands, contact, ghosts),
+        glb=glb.glb_bytes(clip, hands, contact, ghosts),
         title=title,
         view=view_of(clip, hands),
         caption=caption,
-        legend=_legend(clip) + ((("as recorded", css_colour(GHOST_COLOUR)),) if ghosts else ()),
+        legend=_legend(clip) + ((("as recorded", css_colour(glb.GHOST_COLOUR)),) if ghosts else ()),
         contact_label=contact_label if contact is not None else "",
     )
 
@@ -100,26 +90,21 @@ def motion_player(
 def contact_player(
     clip: Clip, paint: ContactPaint, title: str, caption: str, label: str, look_at: ContactPaint | None = None
 ) -> Player:
-    """A player of the object in the pose of the first frame, coloured by a contact map.
+    """A player of the object in the pose of the first frame, coloured by ``paint``; ``label``: what the colours mean.
 
-    Args:
-        label: the meaning of the colours.
-        look_at: the map whose touched side the camera sees; by default ``paint``.
+    The camera sees the touched side of the map ``look_at``, by default of ``paint``.
     """
     absent = {side: replace(track, valid=np.zeros_like(track.valid)) for side, track in clip.hands.items()}
     still = replace(clip, hands=absent, other_objects=()).take(slice(0, 1))
     view = _still_view(still, _touched_side(still, look_at or paint))
-    return Player(glb=glb_bytes(still, None, paint), title=title, view=view, caption=caption, contact_label=label)
+    return Player(glb=glb.glb_bytes(still, None, paint), title=title, view=view, caption=caption, contact_label=label)
 
 
 def write_page(path: str | Path, template: str, **values: object) -> Path:
     """Write the HTML of one template of this package; values are escaped, and an undefined name is an error."""
+    loader = FileSystemLoader(_FOLDER)
     environment = Environment(
-        loader=FileSystemLoader(_FOLDER),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     has_players = bool(values.get("has_players"))
     page = environment.get_template(template).render(
@@ -142,12 +127,12 @@ def css_colour(colour: tuple[float, float, float]) -> str:
 
 
 def _legend(clip: Clip) -> tuple[tuple[str, str], ...]:
-    rows = [(f"{side} hand", css_colour(HAND_COLOURS[side])) for side in SIDES if clip.hands[side].valid.any()]
-    rows.append((clip.object_words, css_colour(OBJECT_COLOUR)))
+    rows = [(f"{side} hand", css_colour(glb.HAND_COLOURS[side])) for side in SIDES if clip.hands[side].valid.any()]
+    rows.append((clip.object_words, css_colour(glb.OBJECT_COLOUR)))
     if clip.object.is_articulated:
-        rows.append(("moving part", css_colour(MOVING_PART_COLOUR)))
+        rows.append(("moving part", css_colour(glb.MOVING_PART_COLOUR)))
     if others := dict.fromkeys(track.model.name.replace("_", " ") for track in clip.other_objects):
-        rows.append((", ".join(others), css_colour(OTHER_OBJECT_COLOUR)))
+        rows.append((", ".join(others), css_colour(glb.OTHER_OBJECT_COLOUR)))
     return tuple(rows)
 
 
@@ -156,7 +141,7 @@ def view_of(clip: Clip, hands: HandPair) -> View:
 
     The ground is at the lowest point of all objects, tables included, and of all hands.
     """
-    upright = upright_rotation(clip.gravity).as_matrix()
+    upright = glb.upright_rotation(clip.gravity).as_matrix()
     object_points = _object_points(clip.object) @ upright.T
     others = [_object_points(track) @ upright.T for track in clip.other_objects]
     tracks = [(track, hands[side]) for side, track in clip.hands.items() if track.valid.any()]
@@ -179,7 +164,7 @@ def view_of(clip: Clip, hands: HandPair) -> View:
 
 def _still_view(clip: Clip, look_from: np.ndarray) -> View:
     """A camera that sees the object of a one-frame clip from ``look_from`` (3,), at least a little from above."""
-    points = _object_points(clip.object)[0] @ upright_rotation(clip.gravity).as_matrix().T
+    points = _object_points(clip.object)[0] @ glb.upright_rotation(clip.gravity).as_matrix().T
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     return View(
         centre=_rounded(centre),
@@ -193,7 +178,7 @@ def _still_view(clip: Clip, look_from: np.ndarray) -> View:
 
 def _touched_side(clip: Clip, paint: ContactPaint) -> np.ndarray:
     """(3,) unit direction from the object's centre to its touched side, in the upright world of the first frame."""
-    rotation = upright_rotation(clip.gravity).as_matrix() @ rotvec_to_rotmat(clip.object.rotvec[:1])[0]
+    rotation = glb.upright_rotation(clip.gravity).as_matrix() @ rotvec_to_rotmat(clip.object.rotvec[:1])[0]
     toward = (paint.points_m - paint.points_m.mean(axis=0)).T @ paint.value
     direction = rotation @ toward + np.array((1e-6, 0.0, 1e-6))
     return direction / np.linalg.norm(direction)
@@ -216,13 +201,12 @@ def _comes_near(joints: np.ndarray, valid: np.ndarray, object_points: np.ndarray
 
 def _side_azimuth(object_points: np.ndarray, hand_points: list[np.ndarray]) -> float:
     """Azimuth across the line from hands to object, so that neither occludes the other; pi/5 without hands."""
-    if not hand_points:
-        return float(np.pi / 5)
-    wrists = np.concatenate([points[:, 0] for points in hand_points]).mean(axis=0)
-    toward = object_points.reshape(-1, 3).mean(axis=0) - wrists
-    if np.hypot(toward[0], toward[2]) < 1e-3:
-        return float(np.pi / 5)
-    return float(np.arctan2(toward[0], toward[2]) + np.radians(65.0))
+    if hand_points:
+        wrists = np.concatenate([points[:, 0] for points in hand_points]).mean(axis=0)
+        toward = object_points.reshape(-1, 3).mean(axis=0) - wrists
+        if np.hypot(toward[0], toward[2]) >= 1e-3:
+            return float(np.arctan2(toward[0], toward[2]) + np.radians(65.0))
+    return float(np.pi / 5)
 
 
 def _rounded(vector: np.ndarray) -> tuple[float, float, float]:

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -49,11 +49,11 @@ class QualityFacts:
     clips: list[MeasureRow]
     meshes: list[MeasureRow]
     chart: Markup
-    failed: list[tuple[str, str]] = field(default_factory=list)  # (clip, reason)
-    warned: list[tuple[str, str]] = field(default_factory=list)  # (clip, reason)
-    unsound: list[tuple[str, str, str]] = field(default_factory=list)  # (object, verdict, reason)
-    notes: list[tuple[str, int]] = field(default_factory=list)  # (note, clips)
-    unmeasured: list[tuple[str, str, int]] = field(default_factory=list)  # (measure, reason, clips)
+    failed: list[tuple[str, str]]  # (clip, reason)
+    warned: list[tuple[str, str]]  # (clip, reason)
+    unsound: list[list[str]]  # object, verdict, reason
+    notes: list[tuple[str, int]]  # (note, clips)
+    unmeasured: list[tuple[str, str, int]]  # (measure, reason, clips)
 
 
 def read_quality(folder: Path, dataset: str) -> QualityFacts | None:
@@ -64,21 +64,18 @@ def read_quality(folder: Path, dataset: str) -> QualityFacts | None:
     clips, meshes = (read_table(folder / f"{name}.parquet") for name in ("clips", "meshes"))
     if not len(clips):
         return None
-    limits = read_limits(folder)
+    limits, judged = read_limits(folder), clips[["clip_id", "verdict", "reasons"]].to_numpy().tolist()
+    missing = {measure: int(np.isnan(_values(clips, measure)).sum()) for measure in CLIP_MEASURES}
     return QualityFacts(
         summary=_summary(info["counts"]),
         clips=[_row(clips, "clip_id", measure, limits[measure.name]) for measure in CLIP_MEASURES],
         meshes=[_row(meshes, "object", measure, limits[measure.name]) for measure in MESH_MEASURES],
         chart=Markup(measures_svg(clips, CLIP_MEASURES, limits, f"{dataset} quality")),
-        failed=[(name, why) for name, verdict, why in _judged(clips, "clip_id") if verdict == "left out"],
-        warned=[(name, why) for name, verdict, why in _judged(clips, "clip_id") if verdict == "warned"],
-        unsound=[record for record in _judged(meshes, "object") if record[1] != "ok"],
+        failed=[(name, why) for name, verdict, why in judged if verdict == "left out"],
+        warned=[(name, why) for name, verdict, why in judged if verdict == "warned"],
+        unsound=[row for row in meshes[["object", "verdict", "reasons"]].to_numpy().tolist() if row[1] != "ok"],
         notes=sorted(Counter(note for note in clips["note"].tolist() if note).items()),
-        unmeasured=[
-            (measure.words, measure.unmeasured, missing)
-            for measure in CLIP_MEASURES
-            if (missing := int(np.isnan(_values(clips, measure)).sum()))
-        ],
+        unmeasured=[(measure.words, measure.unmeasured, count) for measure, count in missing.items() if count],
     )
 
 
@@ -165,8 +162,3 @@ def _summary(counts: Mapping[str, int]) -> str:
         f"meshes {counts['objects_warned']:,} have warnings and {counts['objects_left_out']:,} are excluded with their "
         "clips."
     )
-
-
-def _judged(table: pd.DataFrame, key: str) -> list[tuple[str, str, str]]:
-    """(name, verdict, reasons) of each clip or mesh."""
-    return list(zip(*(table[column].tolist() for column in (key, "verdict", "reasons")), strict=True))

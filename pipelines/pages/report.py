@@ -7,22 +7,24 @@ from pathlib import Path
 from markupsafe import Markup
 
 from hoidata.clips.clip import Clip
+from hoidata.contact.maps import f1_score
 from hoidata.dataset_folders import dataset_title
 from hoidata.files.written import empty_reason
 from hoidata.hands import HandPair
+from hoidata.metrics.verdict import summary, verdict
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.info import embedded_hand_warning
-from pipelines.pages.curves import Panel, log_curves, panels_svg, read_log
-from pipelines.pages.dataset_facts import DatasetFacts, read_dataset
-from pipelines.pages.dataset_page import can_be_shown, write_dataset_page
+from pipelines.pages.curves import Panel, log_curves, panels_svg
+from pipelines.pages.dataset_facts import DatasetFacts, has_tables, read_dataset
+from pipelines.pages.dataset_page import write_dataset_page
 from pipelines.pages.examples import first_motion, motion_contact, shown_ids, shown_subset, true_contact
 from pipelines.pages.metrics_table import CONTROLS, RETRIEVAL_BASELINES, MetricsTable, metrics_tables
 from pipelines.pages.player import Player, contact_player, motion_player, write_page
 from pipelines.pages.quality import QualityFacts, read_quality
-from pipelines.pages.summary import MAX_EXAMINED, Summary, dataset_summary
 from pipelines.pages.surface import ContactPaint
 
 CONTACT_EXAMPLES = 3
+MAX_EXAMINED = 6  # motions of a dataset; a verdict takes about half a second
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,29 @@ class ReportFolders:
     @classmethod
     def of(cls, profile: str, root: str | Path = ".") -> "ReportFolders":
         return cls(*(Path(root, name, profile) for name in ("data", "checkpoints", "samples", "metrics")))
+
+
+@dataclass(frozen=True)
+class Example:
+    """A generated motion for a held-out clip, examined."""
+
+    clip_id: str
+    sentence: str
+    motion: Clip
+    paint: ContactPaint  # the points that it touches
+    words: str  # its verdict and contact F1
+    rank: tuple[int, float]  # failed checks, and contact F1 subtracted from 1; the least is the best
+
+
+@dataclass(frozen=True)
+class Summary:
+    """One dataset of the summary."""
+
+    trained: str
+    compared: str  # with retrieval baselines
+    examined: int  # number of motions
+    best: Example | None = None
+    worst: Example | None = None
 
 
 @dataclass(frozen=True)
@@ -70,17 +95,13 @@ def write_report(
     profile: str,
     families: Mapping[str, Sequence[str]],
     hands: HandPair,
-    folders: ReportFolders | None = None,
+    folders: ReportFolders,
 ) -> Path:
     """Write ``out/index.html``, the pages of datasets ``out/<dataset>.html`` and of their examples in ``out/clips``.
 
-    Equal inputs give equal bytes. Datasets without clips are listed with their reason.
-
-    Args:
-        families: by dataset, in the order of the table. Motions of the first one are shown next to recorded ones.
-        folders: outputs of the stages; by default those below the current folder.
+    Equal inputs give equal bytes. Datasets without clips are listed with their reason. ``families`` are by dataset, in
+    the order of the table; motions of the first one are shown next to recorded ones.
     """
-    folders = folders or ReportFolders.of(profile)
     all_sections = [_section(name, folders, names, hands) for name, names in families.items()]
     sections = [section for section in all_sections if not section.facts.empty or section.facts.quarantine]
     synthetic = any(section.facts.synthetic for section in sections)
@@ -90,8 +111,9 @@ def write_report(
             write_dataset_page(out, folders.data / section.facts.name, section.facts.name, hands, section.title)
     return write_page(
         Path(out) / "index.html", "report.html", title=f"hoidata report: {profile}", profile=profile, sections=sections,
-        empty_sections=[section for section in all_sections if section.facts.empty], synthetic=synthetic,
-        hand_model=hands.name, has_players=has_players, max_examined=MAX_EXAMINED, stand_ins=_stand_ins(sections),
+        empty=[(section.title, section.facts.empty) for section in all_sections if section.facts.empty],
+        synthetic=synthetic, hand_model=hands.name, has_players=has_players, max_examined=MAX_EXAMINED,
+        stand_ins=_stand_ins(sections),
     )  # fmt: skip
 
 
@@ -116,11 +138,11 @@ def _section(name: str, folders: ReportFolders, families: Sequence[str], hands: 
     table = metrics_tables(folders.metrics / name, families)
     reasons = {folder.name: empty_reason(folder) for folder in networks}
     trained = [name for name, reason in reasons.items() if not reason]
-    summary = dataset_summary(facts.annotated, trained, families[0], samples, table, hands)
+    summary = _summary(facts.annotated, trained, families[0], samples, table, hands)
     return Section(
         facts,
         title,
-        page=f"{name}.html" if can_be_shown(folders.data / name) else "",
+        page=f"{name}.html" if has_tables(folders.data / name, "quality/clips.parquet") else "",
         shown=_shown_words(facts),
         quality=read_quality(folders.data / name / "quality", name),
         motions=motions,
@@ -135,14 +157,11 @@ def _section(name: str, folders: ReportFolders, families: Sequence[str], hands: 
 
 
 def _example_players(annotated: AnnotatedStore | None, summary: Summary, hands: HandPair) -> list[Player]:
-    examples = [(kind, one) for kind, one in (("Best", summary.best), ("Worst", summary.worst)) if one is not None]
-    if annotated is None:
-        return []
-    return [
-        _player(annotated, one.clip_id, one.motion, hands, f"{kind}, {one.words}",
-                motion_contact(annotated, one.clip_id, one.motion, hands))
-        for kind, one in examples
-    ]  # fmt: skip
+    players = []
+    for kind, one in (("Best", summary.best), ("Worst", summary.worst)):
+        if annotated is not None and one is not None:
+            players.append(_player(annotated, one.clip_id, one.motion, hands, f"{kind}, {one.words}", one.paint))
+    return players
 
 
 def _shown_words(facts: DatasetFacts) -> str:
@@ -153,21 +172,17 @@ def _shown_words(facts: DatasetFacts) -> str:
 
 def _sample_folders(samples: Path, family: str) -> dict[str, Path]:
     """The sample folders to show next to the recorded clip: of the family, and of the best retrieval baseline."""
-    retrieval_folders = [
-        path
-        for name in RETRIEVAL_BASELINES[::-1]
-        for path in (samples / CONTROLS / name, samples / name)
-        if path.is_dir()
-    ]
-    return {f"Generated by {family}": samples / family} | {
-        f"Retrieved ({path.name})": path for path in retrieval_folders[:1]
-    }
+    folders = [path for name in RETRIEVAL_BASELINES[::-1] for path in (samples / CONTROLS / name, samples / name)]
+    retrieved = next((path for path in folders if path.is_dir()), None)
+    return {f"Generated by {family}": samples / family} | (
+        {f"Retrieved ({retrieved.name})": retrieved} if retrieved else {}
+    )
 
 
 def _motions(
     facts: DatasetFacts, hands: HandPair, sample_folders: dict[str, Path]
 ) -> tuple[list[Player], list[tuple[str, str]]]:
-    """Players of a recorded clip and of the sampled motions for its sentence and object, with their ids."""
+    """Players of a recorded clip and of the motions sampled for its sentence and object, with their ids."""
     annotated = facts.annotated
     if annotated is None or not (ids := shown_ids(annotated, 1)):
         return [], []
@@ -217,10 +232,45 @@ def _contact_pairs(facts: DatasetFacts, hands: HandPair, samples: Path) -> list[
 
 def _loss_chart(dataset: str, model: str, log: Path) -> dict[str, str] | None:
     """The losses of a training log: one panel for the training loss and its terms, one for the validation loss."""
-    curves = log_curves(read_log(log)) if log.is_file() else []
+    curves = log_curves(log) if log.is_file() else []
     if not curves:
         return None
     validation = [curve for curve in curves if "valid" in curve.name]
     training = [curve for curve in curves if curve not in validation]
     panels = [Panel(title, part) for title, part in (("training", training), ("validation", validation)) if part]
-    return {"title": model, "svg": Markup(panels_svg(panels, "step", f"{dataset} {model}"))}
+    return {"title": model, "svg": Markup(panels_svg(panels, f"{dataset} {model}"))}
+
+
+def _summary(
+    annotated: AnnotatedStore | None,
+    networks: Sequence[str],
+    family: str,
+    samples: Path,
+    table: MetricsTable,
+    hands: HandPair,
+) -> Summary:
+    """The summary of one dataset; ``family``: the method of the examples, with its motions in ``samples``."""
+    if annotated is None:
+        return Summary("nothing", "", 0)
+    train = annotated.ids("train")
+    kind = "synthetic" if any(annotated.clip(clip_id).synthetic for clip_id in train[:1]) else "recorded"
+    trained = f"{', '.join(networks)} on {len(train):,} {kind} clips" if networks else "nothing"
+    [method] = [one for one in table.methods if one.family == family]
+    words = method.summary or "not worse than retrieval in any metric"
+    compared = method.empty or f"{family}: {words} ({method.note})"
+    examples = sorted(_examples(annotated, samples, hands), key=lambda example: example.rank)
+    if not examples:
+        return Summary(trained, compared, 0)
+    return Summary(trained, compared, len(examples), examples[0], examples[-1] if len(examples) > 1 else None)
+
+
+def _examples(annotated: AnnotatedStore, samples: Path, hands: HandPair) -> list[Example]:
+    examples = []
+    for clip_id in shown_ids(annotated, MAX_EXAMINED):
+        if (motion := first_motion(samples, clip_id, hands)) is not None:
+            checks, paint = verdict(motion, hands), motion_contact(annotated, clip_id, motion, hands)
+            n_failed = sum(check.passed is False for check in checks)
+            f1, sentence = f1_score(paint.value > 0, annotated.contact(clip_id) > 0), annotated.sentences(clip_id)[0]
+            words = f"{summary(checks)}; contact F1 {f1:.2f}"
+            examples.append(Example(clip_id, sentence, motion, paint, words, (n_failed, 1 - f1)))
+    return examples

@@ -25,40 +25,24 @@ class _SequenceClip(NamedTuple):
 
 
 def write_sequence_page(path: str | Path, annotated: AnnotatedStore, sequence: str) -> Path:
-    """Write the page of a sequence; equal inputs give equal bytes.
-
-    Args:
-        sequence: its name without the dataset's, such as ``s01/box_use_01``; at least one clip is from it.
-    """
-    clips = sorted(
-        (_described(annotated, clip_id) for clip_id in _clip_ids(annotated, sequence)),
-        key=lambda item: int(item.clip.source_frames[0]),
-    )
-    first = clips[0].clip
+    """Write the page of a sequence such as ``s01/box_use_01`` with at least one clip; equal inputs give equal bytes."""
+    sequences = annotated.store.sequences["sequence"].to_dict()
+    clips = [_described(annotated, str(clip_id)) for clip_id, name in sequences.items() if name == sequence]
+    clips.sort(key=lambda item: int(item.clip.source_frames[0]))
+    rows = []
+    for item in clips:
+        frames = f"{item.clip.source_frames[0]} to {item.clip.source_frames[-1]}"
+        rows.append((item.clip.clip_id, frames, item.verb, item.hand_type, item.sentence))
     return write_page(
         path,
         "sequence_page.html",
         title=f"{annotated.store.info['dataset']}/{sequence}",
-        synthetic=first.synthetic,
+        synthetic=clips[0].clip.synthetic,
         timeline=Markup(_timeline(annotated, clips)),
-        rows=[
-            (
-                item.clip.clip_id,
-                f"{item.clip.source_frames[0]} to {item.clip.source_frames[-1]}",
-                item.verb,
-                item.hand_type,
-                item.sentence,
-            )
-            for item in clips
-        ],
+        rows=rows,
         threshold_cm=annotated.contact_threshold_m * 100,
         has_players=False,
     )
-
-
-def _clip_ids(annotated: AnnotatedStore, sequence: str) -> list[str]:
-    sequences = annotated.store.sequences["sequence"].to_dict()
-    return [str(clip_id) for clip_id, name in sequences.items() if name == sequence]
 
 
 def _described(annotated: AnnotatedStore, clip_id: str) -> _SequenceClip:
@@ -73,7 +57,7 @@ def _timeline(annotated: AnnotatedStore, clips: list[_SequenceClip]) -> str:
     last = max(int(item.clip.source_frames[-1]) for item in clips)
     hinge = clips[0].clip.object.model.hinge
     has_hinge = hinge is not None
-    joint_unit = ("slide, cm", 100.0) if hinge and hinge.is_prismatic else ("hinge, degrees", np.degrees(1.0))
+    unit, factor = ("slide, cm", 100.0) if hinge and hinge.is_prismatic else ("hinge, degrees", np.degrees(1.0))
 
     def draw(figure: Figure) -> None:
         rows = figure.subplots(3 if has_hinge else 2, 1, sharex=True, height_ratios=[2] * (1 + has_hinge) + [1])
@@ -87,16 +71,15 @@ def _timeline(annotated: AnnotatedStore, clips: list[_SequenceClip]) -> str:
                 transform=rows[0].get_xaxis_transform(),
             )  # fmt: skip
             if (hinge_rad := item.clip.object.hinge_rad) is not None:
-                rows[-2].plot(frames, joint_unit[1] * hinge_rad, color=OBJECT_COLOUR, linewidth=1.4)
+                rows[-2].plot(frames, factor * hinge_rad, color=OBJECT_COLOUR, linewidth=1.4)
             rows[0].plot(frames, _height_cm(item.clip, clips[0].clip), color=OBJECT_COLOUR, linewidth=1.4)
             evidence = annotated.hand_evidence(item.clip.clip_id)
             for line, side in enumerate(SIDES):
-                near.fill_between(
-                    frames, line, line + 0.8, where=evidence.near(side), color=SIDE_COLOURS[side], linewidth=0
-                )
+                is_near, colour = evidence.near(side), SIDE_COLOURS[side]
+                near.fill_between(frames, line, line + 0.8, where=is_near, color=colour, linewidth=0)
         rows[0].set_ylabel("height, cm")
         if has_hinge:
-            rows[-2].set_ylabel(joint_unit[0])
+            rows[-2].set_ylabel(unit)
         near.set_yticks([0.4, 1.4], [f"{side} hand" for side in SIDES])
         near.set_xlabel("frame of the recording")
         near.set_xlim(0, last + 1)

@@ -16,6 +16,6 @@ def run(paths: StagePaths) -> None:
     params = read_params(Path())
     with atomic_folder(paths.report) as partial:
         families = {dataset: families_of(params, dataset) for dataset in params["datasets"]}
-        write_report(partial, paths.profile, families, load_hands(paths.profile))
         folders = ReportFolders.of(paths.profile)
+        write_report(partial, paths.profile, families, load_hands(paths.profile), folders)
         write_dvc_plots(partial, folders.metrics, folders.checkpoints, families)

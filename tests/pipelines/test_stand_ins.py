@@ -12,8 +12,8 @@ from hoidata.store.info import embedded_hand_warning
 from hoidata.store.store import open_store
 from pipelines.commands.adapters import _hands
 from pipelines.commands.store_facts import fact_rows
-from pipelines.exports.describe import Description, dataset_card
-from pipelines.exports.motion import WORLD
+from pipelines.exports.describe import dataset_card
+from pipelines.exports.motion import Format
 from pipelines.pages.report import _stand_ins
 from pipelines.show_pages import write_stored_clip
 from tests.builders import arctic, grab, h2o, hoi4d, hot3d, oakink2, taco
@@ -37,7 +37,7 @@ def test_mano_parameters_converted_with_the_embedded_hand_come_with_a_warning(
     assert capsys.readouterr().out.startswith(f"warning: {name} has MANO parameters, and the embedded hand is not MANO")
     store = open_store(tmp_path / "store")
     assert NUMBERS in dict(fact_rows(store))["hand model"]
-    card = dataset_card(store.folder, store, Description("the store", WORLD, "as stored", columns=(), for_own_use=True))
+    card = dataset_card(store.folder, store, Format("the store"), for_own_use=True)
     assert f"- Warning: {name} has MANO parameters" in card
 
 

@@ -17,12 +17,13 @@ from hoidata.annotation.stage import annotate_store
 from hoidata.clips.clip import CameraTrack, SourceFile
 from hoidata.contact.settings import read_contact_settings
 from hoidata.errors import MissingResource
+from hoidata.files import write_whole
 from hoidata.hands import track_joints, track_vertices
 from hoidata.store.annotated import load_annotated
 from pipelines.pages.clip_page import page_name, paint_values, write_clip_page
 from pipelines.pages.clip_page_facts import clip_facts, measure_clip
 from pipelines.pages.clip_page_timeline import Chart, Line, clip_charts, draw_timeline
-from pipelines.pages.glb import write_glb
+from pipelines.pages.glb import glb_bytes
 from pipelines.pages.player import three_javascript
 from tests.builders.stores import write_annotated
 
@@ -176,7 +177,7 @@ def test_packed_contact_of_every_frame_unpacks_to_the_touched_points(dataset, ha
     clip = dataset.clip("test/s1/lid")
     points = dataset.points("lidded box")
     touched = measure_clip(dataset, clip, hands).touched
-    values = json.loads(json.dumps(paint_values(clip, points, touched)))
+    values = json.loads(json.dumps(paint_values(clip, points, touched, {})))
     for side in ("left", "right"):
         data = base64.b64decode(values[side])
         for frame in (0, 11, 23):
@@ -188,8 +189,8 @@ def test_packed_contact_of_every_frame_unpacks_to_the_touched_points(dataset, ha
 def test_every_painted_mesh_of_the_glb_finds_its_points_where_its_vertices_are(dataset, hands, read_glb, tmp_path):
     clip = dataset.clip("test/s1/lid")
     points = dataset.points("lidded box")
-    glb = read_glb(write_glb(tmp_path / "clip.glb", clip, hands))
-    values = paint_values(clip, points, measure_clip(dataset, clip, hands).touched)
+    glb = read_glb(write_whole(tmp_path / "clip.glb", glb_bytes(clip, hands)))
+    values = paint_values(clip, points, measure_clip(dataset, clip, hands).touched, {})
     assert sorted(number for part in values["parts"] for number in part["numbers"]) == list(range(len(points)))
     assert len(values["parts"]) == 2
     for part in values["parts"]:
@@ -313,9 +314,8 @@ def test_cursor_of_the_first_and_the_last_frame_lie_at_the_ends_of_the_lines(dat
 def test_values_under_the_cursor_are_empty_where_a_hand_is_not_valid(dataset, hands):
     series = measure_clip(dataset, dataset.clip("test/s2/box"), hands)
     charts = clip_charts(series, ["right"], 1024)
-    near = draw_timeline(charts, "salt").charts[1]
-    assert near.title == "distance of the closest joint to the object"
-    values = near.lines[0]["values"]
+    assert charts[1].title == "distance of the closest joint to the object"
+    values = draw_timeline(charts, "salt").charts[1][1][0]["values"]
     assert values[5:10] == [None] * 5
     assert values[4] == pytest.approx(series.evidence.distance_m["right"][4] * 100, abs=0.05)
 

@@ -13,14 +13,7 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.files.written import read_table
 from hoidata.store.annotated import load_annotated
 from pipelines.pages.dataset_facts import majority_verb, read_dataset
-from pipelines.pages.dataset_page import (
-    can_be_shown,
-    contact_by_object,
-    count_bars,
-    example_ids,
-    still_of,
-    write_dataset_page,
-)
+from pipelines.pages.dataset_page import contact_by_object, count_bars, example_ids, still_of, write_dataset_page
 from pipelines.pages.player import view_of
 from pipelines.pages.report import ReportFolders, write_report
 from pipelines.show_pages import closest_ids, dataset_of_clip, write_named_page
@@ -61,8 +54,8 @@ def project(written, tmp_path, monkeypatch):
 
 def test_bars_count_every_clip_most_frequent_first():
     chart = count_bars("verb", ["lift", "open", "lift", None, "open", "lift"], "no label")
-    assert [(bar.name, bar.clips) for bar in chart.bars] == [("lift", 3), ("open", 2), ("no label", 1)]
-    assert [bar.width for bar in chart.bars] == pytest.approx([100, 66.67, 33.33], abs=0.01)
+    assert [(name, clips) for name, clips, _ in chart.bars] == [("lift", 3), ("open", 2), ("no label", 1)]
+    assert [width for _, _, width in chart.bars] == pytest.approx([100, 66.67, 33.33], abs=0.01)
     many = count_bars("object", [f"thing {number:02d}" for number in range(30)] * 2, "")
     assert len(many.bars) == 24
     assert many.rest == "and 6 others with 12 clips"
@@ -174,7 +167,6 @@ def test_still_shows_the_frame_in_which_most_points_are_touched(project, hands):
 
 @pytest.mark.slow
 def test_report_links_the_page_of_each_dataset_that_has_what_it_needs(project, hands, tmp_path):
-    assert can_be_shown(project)
     page = write_report(
         tmp_path / "report",
         "embedded",

@@ -15,7 +15,8 @@ from hoidata.hands import track_joints
 from hoidata.metrics.verdict import Check
 from hoidata.objects.sampling import sample_points
 from models.text2hoi.generation import GeneratedMotion
-from pipelines.pages.generation_page import ARRAYS, reached_contact, write_generation
+from pipelines.pages.examples import touched_points
+from pipelines.pages.generation_page import ARRAYS, write_generation
 from pipelines.pages.player import three_javascript
 
 TEXT = "Lift a box & hold it with the right hand."
@@ -116,7 +117,7 @@ def test_page_names_seed_hands_length_models_and_untrained_inputs(motion, write)
 
 
 def test_generated_contact_is_that_of_joints_near_points(motion, hands, write):
-    reached = reached_contact(motion, hands)
+    reached = touched_points(motion.clip, hands, motion.points, 0.02)
     track = motion.clip.hands["right"]
     entries = ProximityIndex(motion.points).entries(
         track_joints(track, hands.right), track.valid, motion.clip.object, 0.02

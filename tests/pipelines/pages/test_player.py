@@ -11,10 +11,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import ObjectTrack
+from hoidata.files import write_whole
 from hoidata.hands import HandKinematics, track_joints, track_rotmats
 from hoidata.hands.model import HandModel
 from hoidata.objects.model import ObjectModel
-from pipelines.pages.glb import contact_colours, continuous_quaternions, glb_bytes, upright_rotation, write_glb
+from pipelines.pages.glb import contact_colours, continuous_quaternions, glb_bytes, upright_rotation
 from pipelines.pages.player import motion_player, three_javascript, view_of
 from pipelines.pages.surface import ContactPaint, crease_normals, paint_values
 
@@ -27,7 +28,7 @@ def without_pose_correctives(model: HandModel) -> HandModel:
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_skinned_hand_equals_the_kinematics_without_pose_correctives(side, hands, page_clip, read_glb, tmp_path):
     clip = page_clip(right=True, left=True)
-    glb = read_glb(write_glb(tmp_path / "motion.glb", clip, hands))
+    glb = read_glb(write_whole(tmp_path / "motion.glb", glb_bytes(clip, hands)))
     track = clip.hands[side]
     layer = HandKinematics(without_pose_correctives(hands[side]), torch.float64)
     vertices, _ = layer(
@@ -39,7 +40,7 @@ def test_skinned_hand_equals_the_kinematics_without_pose_correctives(side, hands
 
 def test_skeleton_nodes_lie_on_the_joints_of_the_track(hands, page_clip, read_glb, tmp_path):
     clip = page_clip()
-    glb = read_glb(write_glb(tmp_path / "motion.glb", clip, hands))
+    glb = read_glb(write_whole(tmp_path / "motion.glb", glb_bytes(clip, hands)))
     joints = track_joints(clip.hands["right"], hands.right)[7]
     for joint, name in ((0, "wrist"), (3, "index3"), (15, "thumb3")):
         position = glb.world_matrix(glb.node(f"right {name}"), 7, world=False)[:3, 3]
@@ -47,7 +48,8 @@ def test_skeleton_nodes_lie_on_the_joints_of_the_track(hands, page_clip, read_gl
 
 
 def test_hand_that_is_never_valid_is_not_in_the_file(hands, page_clip, read_glb, tmp_path):
-    names = read_glb(write_glb(tmp_path / "motion.glb", page_clip(right=True, left=False), hands)).node_names()
+    glb = glb_bytes(page_clip(right=True, left=False), hands)
+    names = read_glb(write_whole(tmp_path / "motion.glb", glb)).node_names()
     assert "right hand" in names
     assert not [name for name in names if name.startswith("left")]
 
@@ -55,14 +57,14 @@ def test_hand_that_is_never_valid_is_not_in_the_file(hands, page_clip, read_glb,
 def test_hand_vanishes_in_frames_where_it_means_nothing(hands, page_clip, read_glb, tmp_path):
     clip = page_clip()
     clip.hands["right"].valid[:5] = False
-    glb = read_glb(write_glb(tmp_path / "motion.glb", clip, hands))
+    glb = read_glb(write_whole(tmp_path / "motion.glb", glb_bytes(clip, hands)))
     assert np.ptp(glb.skinned("right hand", 2), axis=0).max() < 1e-6
     assert np.ptp(glb.skinned("right hand", 5), axis=0).max() > 0.1
 
 
 def test_moving_part_turns_about_the_hinge_line(hands, page_clip, read_glb, tmp_path):
     clip = page_clip(hinged=True)
-    glb = read_glb(write_glb(tmp_path / "motion.glb", clip, hands))
+    glb = read_glb(write_whole(tmp_path / "motion.glb", glb_bytes(clip, hands)))
     model, track, frame = clip.object.model, clip.object, 20
     angle = Rotation.from_rotvec(model.hinge.axis * track.hinge_rad[frame]).as_matrix()
     lid = model.vertices_m[model.part == 1]
@@ -80,7 +82,7 @@ def test_gravity_points_down_in_the_viewer(page_clip):
 
 
 def test_trimesh_opens_the_file_and_finds_the_same_triangles(hands, page_clip, tmp_path):
-    scene = trimesh.load_scene(write_glb(tmp_path / "motion.glb", page_clip(), hands))
+    scene = trimesh.load_scene(write_whole(tmp_path / "motion.glb", glb_bytes(page_clip(), hands)))
     counts = sorted(len(geometry.faces) for geometry in scene.geometry.values())
     assert counts == [12, 1538]
 
@@ -96,7 +98,7 @@ def test_touched_corner_is_painted_and_the_far_side_is_not(hands, page_clip, rea
     points, _ = trimesh.sample.sample_surface(mesh, 1024, seed=3)
     corner = model.vertices_m.max(axis=0)
     paint = ContactPaint(points, np.zeros(1024), (np.linalg.norm(points - corner, axis=1) < 0.03).astype(float))
-    glb = read_glb(write_glb(tmp_path / "motion.glb", clip, hands, paint))
+    glb = read_glb(write_whole(tmp_path / "motion.glb", glb_bytes(clip, hands, paint)))
     attributes = glb.document.meshes[glb.document.nodes[glb.node("box base mesh")].mesh].primitives[0].attributes
     position, colour = glb.array(attributes.POSITION), glb.array(attributes.COLOR_0)
     red = contact_colours(np.array([1.0]))[0]

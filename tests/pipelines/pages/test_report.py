@@ -10,7 +10,7 @@ from hoidata.store.annotated import load_annotated
 from models.common.predicting import sample_family
 from models.registry import load_family
 from pipelines.metrics_files import write_leading_metrics
-from pipelines.pages.curves import Curve, Panel, log_curves, panels_svg, read_log
+from pipelines.pages.curves import Curve, Panel, log_curves, panels_svg
 from pipelines.pages.examples import shown_ids
 from pipelines.pages.player import three_javascript
 from pipelines.pages.report import ReportFolders, write_report
@@ -122,7 +122,7 @@ def test_shown_clips_are_held_out_ones(folders, hands):
 
 
 def test_log_columns_become_curves_without_their_gaps(folders):
-    curves = log_curves(read_log(folders.checkpoints / "grab" / "contact" / "log.csv"))
+    curves = log_curves(folders.checkpoints / "grab" / "contact" / "log.csv")
     assert [curve.name for curve in curves] == ["loss", "validation loss"]
     assert curves[1].x.tolist() == [0, 20]
     assert curves[1].y.tolist() == [4.2, 0.3]
@@ -130,8 +130,8 @@ def test_log_columns_become_curves_without_their_gaps(folders):
 
 def test_charts_repeat_and_keep_their_ids_apart():
     panels = [Panel("training", [Curve("loss", np.arange(5.0), np.arange(5.0) ** 2)])]
-    assert panels_svg(panels, "step", "a") == panels_svg(panels, "step", "a")
-    ids = [set(re.findall(r'id="([mp][0-9a-f]{10})"', panels_svg(panels, "step", salt))) for salt in "ab"]
+    assert panels_svg(panels, "a") == panels_svg(panels, "a")
+    ids = [set(re.findall(r'id="([mp][0-9a-f]{10})"', panels_svg(panels, salt))) for salt in "ab"]
     assert ids[0]
     assert not ids[0] & ids[1]
 

@@ -20,9 +20,9 @@ from hoidata.datasets.hot3d.files import NOUNS, object_words
 from hoidata.errors import BadInput
 from hoidata.hands import track_joints
 from hoidata.store.store import open_store
-from pipelines.exports.describe import Description, dataset_card
+from pipelines.exports.describe import dataset_card
 from pipelines.exports.licences import licences_of
-from pipelines.exports.motion import WORLD
+from pipelines.exports.motion import Format
 from tests.builders import hot3d
 from tests.builders.corruption import replaced
 from tests.builders.formulas import chain, rest_points
@@ -363,7 +363,7 @@ def test_each_kind_of_array_has_the_licence_of_its_files(root: Path, tmp_path: P
     }
     assert [name for name, row in rows.items() if row.may_be_shared and name != "hand surface"] == ["object motion"]
     assert "CC BY-NC-SA" in rows["hands"].licence
-    card = dataset_card(store.folder, store, Description("the store", WORLD, "", (), True))
+    card = dataset_card(store.folder, store, Format("the store"), for_own_use=True)
     assert "- LicenseRef-hot3d-object-meshes: CC BY-SA, changed so that no object or model may be sold" in card
     with pytest.raises(BadInput, match=r"licences of hot3d: expected some of hands, .*got feet"):
         licences_of(store.info | {"licences": {"feet": {"licence": "x", "may_be_shared": True}}})
