@@ -2,7 +2,6 @@
 
 import sys
 from io import TextIOWrapper
-from pathlib import Path
 
 import typer
 
@@ -34,34 +33,20 @@ app.add_typer(synth.app, name="synth", help="Write the generated corpora, or che
 app.add_typer(adapters.app, name="adapters", help="List the dataset adapters, or check one.")
 app.add_typer(raw.app, name="raw", help="Scan your raw files into a manifest, or verify them.")
 app.add_typer(lineage.app, name="lineage")
-app.command("init")(init.init)
-app.command("convert")(adapters.convert)
-app.command("repro")(graph.repro)
-app.command("up")(graph.up)
-app.command("down")(graph.down)
-app.command("doctor")(inspect.doctor)
-app.command("info")(inspect.info)
-app.command("validate")(inspect.validate)
-app.command("profile")(raw.profile)
-app.command("settings")(settings.settings)
-app.command("share")(share.share)
-app.command("evaluate")(evaluate.evaluate)
-app.command("compare")(evaluate.compare)
-app.command("controls")(evaluate.controls)
-app.command("table")(evaluate.table)
-app.command("generate")(motions.generate)
-app.command("animate")(motions.animate)
-app.command("stream")(motions.stream)
-app.command("hands")(motions.hands)
-app.command("show")(show.show)
-app.command("export")(export.export)
+for command in (
+    *(init.init, adapters.convert, graph.repro, graph.up, graph.down, inspect.doctor, inspect.info, inspect.validate),
+    *(raw.profile, settings.settings, share.share, evaluate.evaluate, evaluate.compare, evaluate.controls),
+    *(evaluate.table, motions.generate, motions.animate, motions.stream, motions.hands, show.show, export.export),
+):
+    app.command()(command)
 
 
 @app.callback()
 def _check_digests_of_read_files() -> None:
     from hoidata.files.written import verify_with
+    from pipelines.lineage.locks import written_digest
 
-    verify_with(_written_digest)
+    verify_with(written_digest)
 
 
 def main() -> None:
@@ -78,12 +63,6 @@ def main() -> None:
 
         Console(stderr=True).print(f"[bold red]hoidata:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
         sys.exit(1)
-
-
-def _written_digest(path: Path) -> str | None:
-    from pipelines.lineage.locks import written_digest
-
-    return written_digest(path)
 
 
 if __name__ == "__main__":

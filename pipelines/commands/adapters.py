@@ -1,6 +1,5 @@
 """``hoidata adapters`` and ``hoidata convert``: list, check and run dataset adapters without a project."""
 
-import sys
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -8,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from hoidata.errors import BadInput, MissingResource
-from pipelines.commands.project import chosen_hands
+from pipelines.commands.project import chosen_hands, table_console
 from pipelines.params import load_yaml
 
 if TYPE_CHECKING:
@@ -24,21 +23,12 @@ COLOURS = {"pass": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
 Name = Annotated[str, typer.Argument(help="Name of an adapter, as `hoidata adapters list` shows it.")]
 Root = Annotated[Path, typer.Option(help="Folder with the raw files.", exists=True, file_okay=False, resolve_path=True)]
 Sequences = Annotated[int, typer.Option(help="Number of sequences to load, evenly spread.", min=1)]
-Hand = Annotated[
-    str,
-    typer.Option(
-        help="Hand model: embedded, or the folder of the MANO files. Default: the registered MANO files, else embedded."
-    ),
-]
+HAND = "Hand model: embedded, or the folder of the MANO files. Default: "
+Hand = Annotated[str, typer.Option(help=f"{HAND}the registered MANO files, else embedded.")]
+ConvertHand = Annotated[str, typer.Option(help=f"{HAND}HOIDATA_MANO, else registered files.")]
 Setting = Annotated[list[str] | None, typer.Option(help="A setting of the adapter, KEY=VALUE; can be repeated.")]
 Strict = Annotated[bool, typer.Option("--strict", help="Count warnings as failures.")]
 Out = Annotated[Path, typer.Option(help="Folder of the new store of clips; must not exist.", resolve_path=True)]
-ConvertHand = Annotated[
-    str,
-    typer.Option(
-        help="Hand model: embedded, or the folder of the MANO files. Default: HOIDATA_MANO, else registered files."
-    ),
-]
 Jobs = Annotated[int, typer.Option(help="Number of worker processes; 0 means one per core.", min=0)]
 Synthetic = Annotated[bool, typer.Option("--synthetic", help="Mark the store as synthetic, for generated files.")]
 
@@ -48,10 +38,8 @@ def list_adapters() -> None:
     """List all adapters with dataset version, licence, origin, and settings with their defaults."""
     from hoidata.datasets.registry import registered_adapters
 
-    table = Table(show_lines=True)
-    for head in ("name", "version", "licence", "may be shared", "from"):
-        table.add_column(head)
-    table.add_column("settings", overflow="fold")
+    heads = ("name", "version", "licence", "may be shared", "from", Column("settings", overflow="fold"))
+    table = Table(*heads, show_lines=True)
     for entry in registered_adapters():
         if entry.adapter is None:
             table.add_row(entry.name, "", f"[bold red]{escape(entry.problem)}", "", escape(entry.origin), "")
@@ -59,7 +47,7 @@ def list_adapters() -> None:
         facts, settings = entry.adapter, "\n".join(f"{key}={value!r}" for key, value in entry.settings.items())
         shared = "yes" if facts.may_be_shared else "no"
         table.add_row(*map(escape, (entry.name, facts.version, facts.licence, shared, entry.origin, settings)))
-    Console(width=None if sys.stdout.isatty() else 140).print(table)
+    table_console().print(table)
 
 
 @app.command()
@@ -85,12 +73,7 @@ def sentences(
 
 @app.command()
 def check(
-    name: Name,
-    root: Root,
-    sequences: Sequences = 4,
-    hand: Hand = "",
-    setting: Setting = None,
-    strict: Strict = False,
+    name: Name, root: Root, sequences: Sequences = 4, hand: Hand = "", setting: Setting = None, strict: Strict = False
 ) -> None:
     """Run the conformance checks of an adapter on raw files. The exit code is 1 if a check fails.
 
@@ -104,9 +87,24 @@ def check(
     with Console(stderr=True).status(f"loading up to {sequences} sequences of {name}, each several times"):
         findings = check_adapter(adapter, root, hands, sequences)
     bad = {"fail", "warn"} if strict else {"fail"}
-    failed = sum(item.outcome in bad for item in findings)
-    _print(name, findings, note)
-    raise typer.Exit(1 if failed else 0)
+    table = Table("", "rule", "result", title=f"adapter {name}", caption=note)
+    for item in findings:
+        table.add_row(f"[{COLOURS[item.outcome]}]{item.outcome}", escape(item.rule), escape(item.detail))
+    counts = Counter(item.outcome for item in findings)
+    console = table_console()
+    console.print(table)
+    console.print(", ".join(f"{counts[outcome]} {outcome}" for outcome in COLOURS if counts[outcome]))
+    raise typer.Exit(any(item.outcome in bad for item in findings))
+
+
+def _hands(choice: str, needs_mano: bool) -> "tuple[HandPair, str]":
+    """The hand model to check with, and a note for the table."""
+    from hoidata.store.info import EMBEDDED_HAND_ERROR
+
+    hands, note = chosen_hands(choice), ""
+    if needs_mano and hands.name == "embedded":
+        note = f"; with files made for MANO, ignore warnings about touch: {EMBEDDED_HAND_ERROR}"
+    return hands, f"hand: {hands.name}{note}"
 
 
 def convert(
@@ -124,23 +122,21 @@ def convert(
     """
     from hoidata.conversion.convert import convert_dataset
     from hoidata.datasets.registry import get_adapter
-    from pipelines.stages.base import HAND, registered_root
-    from pipelines.stages.base import jobs as cores
+    from pipelines.stages import base
 
     if out.exists():
-        raise BadInput(
-            out, "a path that does not exist", "an existing file or folder", "choose another name, or remove it"
-        )
+        remedy = "choose another name, or remove it"
+        raise BadInput(out, "a path that does not exist", "an existing file or folder", remedy)
     adapter = get_adapter(name, **read_settings(setting or []))
     generated = synthetic or root.with_suffix(".recipe").is_file()
-    if adapter.needs_mano and not hand and not generated and registered_root(HAND) is None:
+    if adapter.needs_mano and not hand and not generated and base.registered_root(base.HAND) is None:
         without_mano = getattr(adapter, "without_mano", "")
         raise MissingResource(
             f"{name} has MANO parameters; name the folder of MANO_RIGHT.pkl and MANO_LEFT.pkl: --hand FOLDER "
             "(register at https://mano.is.tue.mpg.de)" + (f", or use --setting {without_mano}" if without_mano else "")
         )
     hands = chosen_hands(hand or ("embedded" if generated else ""))
-    summary = convert_dataset(adapter, root, hands, out, jobs or cores(), synthetic=generated)
+    summary = convert_dataset(adapter, root, hands, out, jobs or base.jobs(), synthetic=generated)
     typer.echo(out)
     raise typer.Exit(0 if summary.clips else 1)
 
@@ -157,24 +153,3 @@ def read_settings(pairs: list[str]) -> dict[str, Any]:
         except (ValueError, RecursionError) as error:
             raise BadInput(f"--setting {key}", "a value as in params.yaml", str(error)[:300], "correct it") from error
     return settings
-
-
-def _hands(choice: str, needs_mano: bool) -> "tuple[HandPair, str]":
-    """The hand model to check with, and a note for the table."""
-    from hoidata.store.info import EMBEDDED_HAND_ERROR
-
-    hands = chosen_hands(choice)
-    note = f"hand: {hands.name}"
-    if needs_mano and hands.name == "embedded":
-        note += f"; with files made for MANO, ignore warnings about touch: {EMBEDDED_HAND_ERROR}"
-    return hands, note
-
-
-def _print(name: str, findings, note: str) -> None:
-    table = Table("", "rule", "result", title=f"adapter {name}", caption=note)
-    for item in findings:
-        table.add_row(f"[{COLOURS[item.outcome]}]{item.outcome}", escape(item.rule), escape(item.detail))
-    counts = Counter(item.outcome for item in findings)
-    console = Console(width=None if sys.stdout.isatty() else 140)
-    console.print(table)
-    console.print(", ".join(f"{counts[outcome]} {outcome}" for outcome in COLOURS if counts[outcome]))

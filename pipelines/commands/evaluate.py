@@ -1,15 +1,13 @@
 """``hoidata evaluate``, ``compare``, ``table`` and ``controls``: metrics of stores, corpora and negative controls."""
 
 import json
-import sys
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
-from pipelines.commands.project import hands_of_data
+from pipelines.commands.project import hands_of_data, table_console
 
 if TYPE_CHECKING:
     import numpy as np
@@ -51,15 +49,17 @@ def evaluate(
     from hoidata.metrics.evaluate import evaluate_store
     from hoidata.metrics.optional_metrics import select_metrics
     from pipelines.pages.metrics_table import printed_table, unmeasured_lines
-    from pipelines.stages.base import jobs
+    from pipelines.stages.base import StagePaths, jobs
     from pipelines.stages.evaluate import trained_encoders
 
-    encoders = trained_encoders(evaluators or evaluators_of(reference))
+    # Of a dataset data/<profile>/<dataset>; the folder may not exist.
+    of_reference = reference.parents[2] / StagePaths(reference.parent.name, reference.name).evaluators
+    encoders = trained_encoders(evaluators or of_reference)
     hands, chosen_metrics = hands_of_data(reference), select_metrics(filter(None, metrics.split(",")))
     results = evaluate_store(
         store, reference, hands, split=split, metrics=chosen_metrics, encoders=encoders, jobs=jobs(), progress=True
     )
-    Console(width=None if sys.stdout.isatty() else 140).print(printed_table(results))
+    table_console().print(printed_table(results))
     for line in unmeasured_lines(results):
         typer.echo(line)
     skipped: dict[str, list[str]] = {}
@@ -70,14 +70,6 @@ def evaluate(
         typer.echo(f"skipped: {clips[0]}{others}: {reason}")
     if out is not None:
         write_whole(out, json.dumps(results, indent=2, sort_keys=True, allow_nan=False) + "\n")
-
-
-def evaluators_of(reference: Path) -> Path:
-    """The folder of the evaluators of a dataset ``data/<profile>/<dataset>``; it may not exist."""
-    from pipelines.stages.base import StagePaths
-
-    project = reference.parent.parent.parent
-    return project / StagePaths(reference.parent.name, reference.name).evaluators
 
 
 def compare(
@@ -106,19 +98,14 @@ def compare(
     for name in ("statistic", "unit", "mean", "10-90 %", "reference", "10-90 %", "ratio", "KS distance"):
         table.add_column(name, justify="left" if name in ("statistic", "unit") else "right")
     for row in rows:
-        shown = (_mean(row.values), _spread(row.values), _mean(row.reference), _spread(row.reference))
+        shown = (*_mean_and_spread(row.values), *_mean_and_spread(row.reference))
         table.add_row(row.name, row.unit, *shown, f"{row.ratio:.2f}", f"{row.distance:.2f}")
-    Console(width=None if sys.stdout.isatty() else 140).print(table)
+    table_console().print(table)
     typer.echo(f"{len(values['frames with contact'])} and {len(others['frames with contact'])} clips with contact")
     if out is not None:
+        both = {name: {"values": values[name].tolist(), "reference": others[name].tolist()} for name in STATISTICS}
         written = {
-            name: {
-                "meaning": meaning,
-                "unit": unit,
-                "values": values[name].tolist(),
-                "reference": others[name].tolist(),
-            }
-            for name, (unit, meaning) in STATISTICS.items()
+            name: {"meaning": meaning, "unit": unit, **both[name]} for name, (unit, meaning) in STATISTICS.items()
         }
         write_whole(out, json.dumps(written, indent=1, sort_keys=True, allow_nan=False) + "\n")
 
@@ -149,7 +136,7 @@ def controls(
     """
     from pipelines.expected_orderings import check_orderings, datasets_below, read_methods
 
-    console, broken = Console(width=None if sys.stdout.isatty() else 160), 0
+    console, broken = table_console(160), 0
     for dataset in datasets_below(folder):
         results = check_orderings(read_methods(dataset))
         console.print(_table(str(dataset), [item for item in results if list_all or item.holds is not None]))
@@ -163,26 +150,21 @@ def controls(
 
 def _table(title: str, results: "list[OrderingResult]") -> "Table":
     from rich import box
-    from rich.table import Table
+    from rich.table import Column, Table
 
     from pipelines.pages.metrics_table import number
 
-    table = Table("control", "metric", "compared with", title=title, box=box.SIMPLE)
-    for name in ("its value", "control"):
-        table.add_column(name, justify="right")
-    table.add_column("must")
-    table.add_column("holds")
+    values = (Column(name, justify="right") for name in ("its value", "control"))
+    table = Table("control", "metric", "compared with", *values, "must", "holds", title=title, box=box.SIMPLE)
     for item in results:
         ordering, values = item.ordering, (number(item.reference), number(item.value))
         table.add_row(ordering.control, ordering.metric, ordering.reference, *values, ordering.must, WORDS[item.holds])
     return table
 
 
-def _mean(values: "np.ndarray") -> str:
-    return f"{values.mean():.3g}" if len(values) else "not measured"
-
-
-def _spread(values: "np.ndarray") -> str:
+def _mean_and_spread(values: "np.ndarray") -> tuple[str, str]:
     import numpy as np
 
-    return "{:.3g}-{:.3g}".format(*np.percentile(values, [10, 90])) if len(values) else ""
+    if not len(values):
+        return "not measured", ""
+    return f"{values.mean():.3g}", "{:.3g}-{:.3g}".format(*np.percentile(values, [10, 90]))

@@ -99,14 +99,11 @@ def diff(
     from pipelines.lineage.targets import find_target
 
     targets = [find_target(root, name, here) for name in (first, second)]
+    where = "hoidata lineage diff"
     if any(target.kind == "motion" for target in targets):
-        raise BadInput(
-            "hoidata lineage diff", "two checkpoints, stores or metric files", "a motion", "name its checkpoints"
-        )
+        raise BadInput(where, "two checkpoints, stores or metric files", "a motion", "name its checkpoints")
     if targets[0].is_of_lock != targets[1].is_of_lock:
-        raise BadInput(
-            "hoidata lineage diff", "two files of one kind", "a checkpoint and another file", "name two of one kind"
-        )
+        raise BadInput(where, "two files of one kind", "a checkpoint and another file", "name two of one kind")
     causes = differences(root, *(target.record for target in targets))
     for line in causes or ["no recorded cause differs"]:
         typer.echo(line)
@@ -128,11 +125,8 @@ def uses(
     from pipelines.lineage.uses import uses as find_uses
 
     outputs = find_uses(root, source)
-    if json:
-        typer.echo(json_module.dumps([vars(use) for use in outputs], indent=2, ensure_ascii=False))
-        return
-    for use in outputs:
-        typer.echo(f"{use.kind} {use.name}: {use.why}")
+    lines = "\n".join(f"{use.kind} {use.name}: {use.why}" for use in outputs)
+    typer.echo(json_module.dumps([vars(use) for use in outputs], indent=2, ensure_ascii=False) if json else lines)
 
 
 @app.command()
@@ -157,10 +151,8 @@ def check(
     from pipelines.lineage.targets import find_target
     from pipelines.params import read_params
 
-    if against:
-        nodes = compare_made(root, against)
-    else:
-        nodes = check_all(root, find_target(root, target, here) if target else None)
+    chosen = find_target(root, target, here) if target and not against else None
+    nodes = compare_made(root, against) if against else check_all(root, chosen)
     deviating = [node for node in nodes if node.status != "same"]
     failed = [node for node in deviating if node.status != "recorded"]
     console = Console()
@@ -215,9 +207,8 @@ def _json(tree, record: dict, sources: list | None) -> dict[str, Any]:
     from pipelines.lineage.tree import overall_status, tree_as_json
 
     facts = {key: record[key] for key in FACTS if key in record}
-    values = {"schema": SCHEMA, "status": overall_status(tree), **facts, "tree": tree_as_json(tree)}
-    raw = {source.store: source.as_json() for source in sources or ()}
-    return values | ({"raw": raw} if sources is not None else {})
+    raw = {} if sources is None else {"raw": {source.store: source.as_json() for source in sources}}
+    return {"schema": SCHEMA, "status": overall_status(tree), **facts, "tree": tree_as_json(tree), **raw}
 
 
 def _print_raw(sources: list) -> None:
@@ -268,6 +259,5 @@ def _label(node) -> str:
     algorithm, _, digest = node.digest.partition(" ")
     short = f"{algorithm} {digest[:12]}" if digest and node.kind != "code" else ""
     detail = "; ".join(filter(None, (node.detail, short)))
-    return f"{node.kind} [bold]{escape(node.name)}[/] [{colour}]{node.status}[/]" + (
-        f" [dim]{escape(detail)}[/]" if detail else ""
-    )
+    label = f"{node.kind} [bold]{escape(node.name)}[/] [{colour}]{node.status}[/]"
+    return f"{label} [dim]{escape(detail)}[/]" if detail else label

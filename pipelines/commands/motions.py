@@ -1,6 +1,7 @@
 """``hoidata generate``, ``animate``, ``stream``, ``hands``: motions for sentences, trajectories, object motions."""
 
 from collections.abc import Mapping
+from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -19,11 +20,7 @@ Out = Annotated[
     typer.Option(help="Output folder for motion.npz, motion.glb and index.html.", resolve_path=True, file_okay=False),
 ]
 Store = Annotated[
-    Path | None,
-    typer.Option(
-        help="Also write a store of clips, a new folder (docs/export.md).",
-        resolve_path=True,
-    ),
+    Path | None, typer.Option(help="Also write a store of clips, a new folder (docs/export.md).", resolve_path=True)
 ]
 Unit = Annotated[str, typer.Option(help="Unit of a mesh file: m, cm, mm, dm or inch. Default: m.")]
 Up = Annotated[
@@ -33,37 +30,19 @@ MeshHinge = Annotated[
     str,
     typer.Option(help="Hinge of a mesh of two pieces, 'px,py,pz dx,dy,dz': point and direction; a slide: direction."),
 ]
-Moving = Annotated[
-    str,
-    typer.Option(help="What moves: joint of a URDF, or pieces of a mesh with --hinge."),
-]
+Moving = Annotated[str, typer.Option(help="What moves: joint of a URDF, or pieces of a mesh with --hinge.")]
 Profile = Annotated[str, typer.Option(help="Profile: embedded, study or own. Default: the one in params.yaml.")]
-
-TracedObject = Annotated[
-    str,
-    typer.Option(
-        "--object", help="The object: a mesh file (OBJ, PLY, STL, GLB), a URDF or its folder, or a dataset's."
-    ),
-]
+MESH = "A mesh file (OBJ, PLY, STL, GLB), a URDF or its folder, or a dataset's object."
+Object = Annotated[str, typer.Option("--object", help=MESH)]
 Fingers = Annotated[Literal["left", "right", "both"], typer.Option(help="Hands to animate.")]
 MeshUnit = Annotated[
     str, typer.Option(help="Unit of a mesh file: m, cm, mm, dm or inch. Default: m, dm with ManipNet's .txt.")
 ]
 WorldUp = Annotated[
-    str,
-    typer.Option(help="World axis that points up, x, y or z, for display and store. Default: from the file."),
+    str, typer.Option(help="World axis that points up, x, y or z, for display and store. Default: from the file.")
 ]
-
-
 # Options of `generate`.
 Text = Annotated[str, typer.Argument(help="The sentence, such as 'Lift a box with the right hand.'")]
-RequestedObject = Annotated[
-    str,
-    typer.Option(
-        "--object",
-        help="A mesh file (OBJ, PLY, STL, GLB), a URDF or its folder, or a dataset's object.",
-    ),
-]
 Seed = Annotated[int, typer.Option(help="Random seed; the same seed gives the same bytes.", min=0, max=2**63 - 1)]
 PromptedHand = Annotated[
     Literal["left", "right", "both"] | None,
@@ -87,9 +66,7 @@ Sampler = Annotated[
 Steps = Annotated[
     int | None,
     typer.Option(
-        help="Number of denoising steps. Default: params.yaml; without it 20, 1000 for preset paper.",
-        min=1,
-        max=1000,
+        help="Number of denoising steps. Default: params.yaml; without it 20, 1000 for preset paper.", min=1, max=1000
     ),
 ]
 Refine = Annotated[
@@ -122,7 +99,7 @@ Encoder = Annotated[
 
 def generate(
     text: Text,
-    object: RequestedObject,
+    object: Object,
     out: Out,
     store: Store = None,
     seed: Seed = 0,
@@ -216,7 +193,7 @@ def animate(
     ],
     out: Out,
     store: Store = None,
-    object: TracedObject = "",
+    object: Object = "",
     fingers: Fingers = "both",
     frames: Annotated[
         str, typer.Option(help="Frames of a clip to replace, FIRST:STOP such as 30:90. Default: all.")
@@ -275,12 +252,9 @@ def animate(
 def stream(
     source: Annotated[
         str,
-        typer.Option(
-            "--from",
-            help="A file of trajectories, or udp://127.0.0.1:PORT for a tracker (docs/fingers.md).",
-        ),
+        typer.Option("--from", help="A file of trajectories, or udp://127.0.0.1:PORT for a tracker (docs/fingers.md)."),
     ],
-    object: TracedObject,
+    object: Object,
     out: Out,
     store: Store = None,
     to: Annotated[str, typer.Option(help="Also send poses to udp://127.0.0.1:PORT.")] = "",
@@ -311,24 +285,16 @@ def stream(
         mesh=MeshOptions(unit, "", hinge, moving),
     )
 
-    def report(line: str) -> None:
-        typer.echo(line, err=True)
-
+    report = partial(typer.echo, err=True)
     written = stream_files(source, options, *project, out, store, typer.echo, report, to=to, in_real_time=not fast)
     for line in (*written.verdict, *written.notes, *written.paths):
-        typer.echo(line, err=True)
+        report(line)
 
 
 def hands(
     out: Out,
     store: Store = None,
-    object: Annotated[
-        str,
-        typer.Argument(
-            metavar="[MESH]",
-            help="A mesh file (OBJ, PLY, STL, GLB), a URDF or its folder, or a dataset's object.",
-        ),
-    ] = "",
+    object: Annotated[str, typer.Argument(metavar="[MESH]", help=MESH)] = "",
     keyframes: Annotated[
         str, typer.Option(help="The object's motion as keyframes: a .csv or .json file (docs/hands.md).")
     ] = "",

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import sys
 import tomllib
 from contextlib import suppress
 from pathlib import Path
@@ -12,9 +13,18 @@ from hoidata.errors import BadInput, MissingResource
 from pipelines.params import read_params
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from hoidata.hands import HandPair
 
 PROFILE = re.compile(r"^profile: *\S+", re.MULTILINE)
+
+
+def table_console(width: int = 140) -> "Console":
+    """A console as wide as the terminal, else ``width`` characters."""
+    from rich.console import Console
+
+    return Console(width=None if sys.stdout.isatty() else width)
 
 
 def enter_project() -> Path:
@@ -86,14 +96,10 @@ def hands_of_data(data: Path) -> "HandPair":
 
 
 def hands_of(digest: str, source: str) -> "HandPair":
-    """The hand model with a digest: the embedded one, or the user's MANO files.
+    """The hand model with a digest: the embedded one, or the user's MANO files. Raises MissingResource if neither has.
 
     Args:
-        digest: of the hand model that ``source`` was made with.
-        source: a store or folder of checkpoints, for the error message.
-
-    Raises:
-        MissingResource: neither has this digest.
+        source: the store or folder of checkpoints that was made with it, for the error message.
     """
     candidates = (chosen_hands(choice) for choice in ("embedded", ""))  # MANO files are read only if needed
     matching = next((hands for hands in candidates if hands.digest == digest), None)

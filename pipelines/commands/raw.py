@@ -52,9 +52,9 @@ def profile(
 ) -> None:
     """Print or choose the profile, the data that the project works on; it is the line profile of params.yaml."""
     enter_project()
-    if name and name not in PROFILES:
-        raise BadInput("hoidata profile", " or ".join(PROFILES), name, "choose one of them")
     if name:
+        if name not in PROFILES:
+            raise BadInput("hoidata profile", " or ".join(PROFILES), name, "choose one of them")
         set_profile(name)
     typer.echo(current_profile())
 
@@ -80,11 +80,7 @@ def _scan_dataset(paths, root: Path):
 
 
 def _require_parts(adapter, root: Path, also: str = "") -> None:
-    """Raise BadInput if the folder lacks a required part; print missing optional parts. Both with their download page.
-
-    Args:
-        also: another problem to add to the message.
-    """
+    """Raise BadInput, with the problem ``also``, if the folder lacks a required part; print missing optional parts."""
     from pipelines.lineage.manifests import missing_parts
 
     missing = missing_parts(adapter, root)
@@ -125,12 +121,8 @@ def verify(dataset: Annotated[str, typer.Argument(help="A dataset. Default: all 
 
 
 def _verify_one(dataset: str, is_required: bool) -> bool:
-    """Print the differences of one dataset's files from its manifest. Returns whether they agree.
-
-    Args:
-        is_required: whether its absence is a problem.
-    """
-    from pipelines.lineage.manifests import read_manifest, verify_files
+    """Print the differences of one dataset's files from its manifest. Returns whether they agree, or may be absent."""
+    from pipelines.lineage.manifests import part_of, read_manifest, verify_files
     from pipelines.stages.adapters import configured_adapter, manifest_of, raw_files
     from pipelines.stages.base import StagePaths
 
@@ -149,7 +141,9 @@ def _verify_one(dataset: str, is_required: bool) -> bool:
     listed = read_manifest(paths.raw_manifest) if manifest.synthetic else manifest
     differences = verify_files(root, listed, adapter.parts)
     for item in differences[:SHOWN_DIFFERENCES]:
-        typer.echo(f"{dataset}: {item.path} is {item.problem}{_where_to_get(adapter, item.path)}")
+        part = part_of(adapter, item.path)
+        where_to_get = f"{part.contents}, from {part.archive}" if part else adapter.where_to_register
+        typer.echo(f"{dataset}: {item.path} is {item.problem} ({where_to_get})")
     if len(differences) > SHOWN_DIFFERENCES:
         typer.echo(f"{dataset}: and {len(differences) - SHOWN_DIFFERENCES} more")
     typer.echo(f"{dataset}: {len(listed.files)} entries, differences: {len(differences) or 'none'}")
@@ -165,10 +159,3 @@ def _print_sources(adapter) -> None:
             optional = f" (not needed with the setting {part.unneeded_with})"
         typer.echo(f"  missing: {part.contents} ({part.patterns[0]}), from {part.archive}{optional}")
     typer.echo(f"  once you have it: hoidata raw scan {adapter.name} --root FOLDER")
-
-
-def _where_to_get(adapter, path: str) -> str:
-    from pipelines.lineage.manifests import part_of
-
-    part = part_of(adapter, path)
-    return f" ({part.contents}, from {part.archive})" if part else f" ({adapter.where_to_register})"

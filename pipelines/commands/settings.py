@@ -1,6 +1,6 @@
 """``hoidata settings``: the settings of all data stages, with defaults."""
 
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import Annotated, Any
 
 import typer
@@ -34,5 +34,4 @@ def settings(section: Annotated[str, typer.Argument(help="One section of params.
 
 def settings_class(section: str) -> Any:
     """The dataclass of a section."""
-    module, name = SECTIONS[section].split(":")
-    return getattr(import_module(module), name)
+    return resolve_name(SECTIONS[section])

@@ -32,12 +32,20 @@ def share(
     enter_project()
     for line in _terms() if on else ():
         typer.echo(line)
-    typer.echo(f".dvc/config.local: derived data {f'goes to {_share_derived()}' if on else _keep_derived()}")
+    from dvc.config import Config
+
+    config: Any = Config(dvc_dir=str(Path(".dvc").absolute()))
+    if on:
+        choice = f"goes to {_share_derived(config)}"
+    else:
+        choice = "stays here"
+        with config.edit("local") as local:
+            local["remote"].pop(DERIVED, None)
+    typer.echo(f".dvc/config.local: derived data {choice}")
 
 
-def _share_derived() -> str:
+def _share_derived(config: Any) -> str:
     """Set the remote of derived outputs to a folder of the project's default remote. Returns its address."""
-    config = _config()
     name = config["core"].get("remote")
     if name is None:
         raise MissingResource("no remote to share with; add one first: `dvc remote add --default NAME ADDRESS`")
@@ -46,18 +54,6 @@ def _share_derived() -> str:
     with config.edit("local") as local:
         local["remote"][DERIVED] = {**shared, "url": address}
     return address
-
-
-def _keep_derived() -> str:
-    with _config().edit("local") as local:
-        local["remote"].pop(DERIVED, None)
-    return "stays here"
-
-
-def _config() -> Any:
-    from dvc.config import Config
-
-    return Config(dvc_dir=str(Path(".dvc").absolute()))
 
 
 def _terms() -> list[str]:

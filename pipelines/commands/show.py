@@ -1,13 +1,12 @@
 """``hoidata show``: a web page about one clip or one dataset."""
 
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hoidata.errors import BadInput, MissingResource
-from pipelines.commands.project import current_profile, enter_project, hands_of
+from hoidata.errors import BadInput
+from pipelines.commands.project import current_profile, enter_project, hands_of_data
 
 Data = Annotated[
     Path | None,
@@ -32,7 +31,10 @@ def show(
 ) -> None:
     """Write a self-contained web page about a clip or a dataset."""
     if data is not None and not figures:
-        pages = [_write_page_of(data, clip_or_dataset, out or Path.cwd())]
+        from pipelines.show_pages import write_page_from
+
+        out = out or Path.cwd()  # before the project is entered
+        pages = [write_page_from(data, clip_or_dataset, hands_of_data(data), out)]
     elif clip_or_dataset and data is None:
         project = enter_project()
         from pipelines.show_pages import write_named_page
@@ -50,14 +52,3 @@ def show(
     typer.echo("\n".join(map(str, pages)))
     if open_page:
         typer.launch(pages[0].resolve().as_uri())
-
-
-def _write_page_of(data: Path, clip_id: str, out: Path) -> Path:
-    """Write the page of a clip in a folder; in a project, hoidata.toml names the user's MANO files."""
-    from hoidata.store.store import read_info
-    from pipelines.show_pages import write_page_from
-
-    with suppress(MissingResource):
-        enter_project()
-    store = data if (data / "meta").is_dir() else data / "clips"
-    return write_page_from(data, clip_id, hands_of(read_info(store)["hand_model"]["digest"], str(data)), out)

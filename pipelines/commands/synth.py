@@ -50,12 +50,9 @@ def check(
         raise BadInput("--size", " or ".join(SIZES), size, "correct it")
     measures = check_corpus(size, seed, jobs())
     Console().print(as_text(measures))
-    sound = np.asarray(
-        (measures["pass %"] >= 98)
-        & (measures["largest hand-object distance mm"] < 20)
-        & (measures["largest penetration mm"] < 10)
-    )
-    raise typer.Exit(0 if sound.all() else 1)
+    is_near = measures["largest hand-object distance mm"] < 20
+    sound = (measures["pass %"] >= 98) & is_near & (measures["largest penetration mm"] < 10)
+    raise typer.Exit(0 if np.asarray(sound).all() else 1)
 
 
 def _chosen(dataset: str, profile: str) -> list[str]:
@@ -64,7 +61,6 @@ def _chosen(dataset: str, profile: str) -> list[str]:
     committed = [read_manifest(path) for path in sorted(Path("manifests", profile).glob("*.json"))]
     generated = [item.dataset for item in committed if item.present and "size" in (item.recipe or {})]
     if not generated or (dataset and dataset not in generated):
-        raise MissingResource(
-            f"the profile {profile} has no corpus {dataset!r}; it has {', '.join(generated) or 'none'}"
-        )
+        existing = ", ".join(generated) or "none"
+        raise MissingResource(f"the profile {profile} has no corpus {dataset!r}; it has {existing}")
     return [dataset] if dataset else generated

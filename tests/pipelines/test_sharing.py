@@ -101,17 +101,19 @@ def test_a_clone_pulls_shared_data_also_after_a_failed_pull(built, project_tools
 @pytest.mark.parametrize("address", ["s3://bucket/team", "s3://bucket/team/", "ssh://host/a"])
 def test_derived_and_other_outputs_have_different_addresses(project, monkeypatch, address):
     """DVC keeps its index of an address between pushes, even if outputs move to another remote."""
-    from pipelines.commands.share import _config, _keep_derived, _share_derived
+    from dvc.config import Config
+
+    from pipelines.commands.share import share
 
     monkeypatch.chdir(project)
-    with _config().edit() as config:
+    with Config.from_cwd().edit() as config:
         config["core"]["remote"] = "team"
         config["remote"]["team"] = {"url": address}
-    assert _share_derived() == f"{address.rstrip('/')}/derived"
-    shared, plain = (_config()["remote"][name]["url"].rstrip("/") for name in ("derived", "team"))
-    assert shared != plain
-    _keep_derived()
-    assert Path(_config()["remote"]["derived"]["url"]).resolve() == (project / ".dvc/cache").resolve()
+    share(on=True)
+    shared, plain = (Config.from_cwd()["remote"][name]["url"].rstrip("/") for name in ("derived", "team"))
+    assert shared == f"{address.rstrip('/')}/derived" != plain
+    share(on=False)
+    assert Path(Config.from_cwd()["remote"]["derived"]["url"]).resolve() == (project / ".dvc/cache").resolve()
 
 
 def test_dvc_and_prefect_in_this_folder_send_no_analytics(monkeypatch):
