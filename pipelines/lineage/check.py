@@ -9,7 +9,6 @@ digests of the weights, whose last bits depend on the processor, and the process
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from hoidata.errors import BadInput
 from hoidata.files.atomic import write_whole
@@ -18,10 +17,11 @@ from hoidata.files.written import read_json
 from hoidata.processor import processor_name
 from pipelines.lineage.locks import Locked, dvc_digest, other_files, read_locks
 from pipelines.lineage.provenance import library_versions
-from pipelines.lineage.raw import raw_list
+from pipelines.lineage.raw import RawList, raw_list
 from pipelines.lineage.targets import Target
-from pipelines.lineage.tree import Node, raw_folder
+from pipelines.lineage.tree import Kind, Node, raw_folder
 
+SCHEMA = "hoidata.made/1"
 SHOWN = 5
 
 
@@ -39,17 +39,14 @@ def _check_output(root: Path, path: str, lock: Locked) -> Iterator[Node]:
         yield Node("data", path, "missing", "noted in dvc.lock")
         return
     others = other_files(root, lock, path)
-    detail = f"differs from dvc.lock: {_shortened(others)}" if others else ""
+    more = f" and {len(others) - SHOWN} more" if len(others) > SHOWN else ""
+    detail = f"differs from dvc.lock: {', '.join(others[:SHOWN])}{more}" if others else ""
     yield Node("data", path, "tampered" if others else "same", detail)
     for file in sorted((root / path).rglob("*.safetensors")):
         yield _check_checksum(file, file.relative_to(root).as_posix())
     listed = raw_list(root, path)
     if listed is not None and listed.files:
-        yield _check_raw(root, path)
-
-
-def _shortened(names: list[str]) -> str:
-    return ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
+        yield _check_raw(root, path, listed)
 
 
 def _check_checksum(file: Path, name: str) -> Node:
@@ -57,30 +54,22 @@ def _check_checksum(file: Path, name: str) -> Node:
         fault = corrupted_part(file)
     except BadInput:
         fault = "header"
-    return (
-        Node("checkpoint", name, "tampered", f"the {fault} differ from their checksum")
-        if fault
-        else Node("checkpoint", name, "same")
-    )
+    detail = f"the {fault} differ from their checksum" if fault else ""
+    return Node("checkpoint", name, "tampered" if fault else "same", detail)
 
 
-def _check_raw(root: Path, path: str) -> Node:
+def _check_raw(root: Path, path: str, listed: RawList) -> Node:
     """Hash the raw files of one dataset and compare them with its manifest."""
     from pipelines.lineage.manifests import read_manifest, verify_files  # imports adapters
 
-    listed, manifest = raw_list(root, path), read_manifest(root / path)
-    assert listed is not None
-    folder = raw_folder(root, path, listed)
+    manifest, folder = read_manifest(root / path), raw_folder(root, path, listed)
     if folder is None or not folder.is_dir():
         return Node("raw", listed.dataset, "missing" if listed.synthetic else "needs licensed data", manifest.licence)
     problems = [item for item in verify_files(folder, manifest) if item.problem != "unlisted"]
     if not problems:
         return Node("raw", folder.as_posix(), "same", f"{len(manifest.files)} files")
     status = "changed" if any(item.problem == "changed" for item in problems) else "missing"
-    return Node("raw", folder.as_posix(), status, ", ".join(f"{item.path} {item.problem}" for item in problems[:5]))
-
-
-SCHEMA = "hoidata.made/1"
+    return Node("raw", folder.as_posix(), status, ", ".join(f"{item.path} {item.problem}" for item in problems[:SHOWN]))
 
 
 def write_made(root: Path, profile: str, path: Path) -> Path:
@@ -88,13 +77,14 @@ def write_made(root: Path, profile: str, path: Path) -> Path:
     outs = sorted(out for lock in read_locks(root).values() for out in lock.outs if out.startswith(f"data/{profile}/"))
     if not outs:
         raise BadInput(root / "dvc.lock", f"a run of the profile {profile}", "none", "run `hoidata repro` first")
+    networks = sorted((root / "checkpoints" / profile).rglob("*.safetensors"), key=Path.as_posix)
     table = {
         "schema": SCHEMA,
         "profile": profile,
         "processor": processor_name(),
         "libraries": library_versions(),
         "outputs": {out: dvc_digest(root / out) for out in outs},
-        "networks": {name: payload_digest(root / name) for name in _networks(root, profile)},
+        "networks": {path.relative_to(root).as_posix(): payload_digest(path) for path in networks},
     }
     return write_whole(path, json.dumps(table, indent=1) + "\n")
 
@@ -102,41 +92,27 @@ def write_made(root: Path, profile: str, path: Path) -> Path:
 def compare_made(root: Path, path: Path) -> list[Node]:
     """Compare the outputs here with a digest table; one node per entry.
 
-    A network with other weights has the status ``recorded`` if its processor or libraries differ, since these change
-    the last bits.
+    Other weights have the status ``recorded`` if processor or libraries differ, since these change the last bits.
     """
     table = read_json(path)
     if table["schema"] != SCHEMA:
         raise BadInput(path, f"schema {SCHEMA}", str(table["schema"]), "use the table of this version")
     table.check({"outputs": dict, "networks": dict, "processor": str, "libraries": dict})
-    nodes = [_node("data", root, name, digest, dvc_digest(root / name)) for name, digest in table["outputs"].items()]
-    environment = "; ".join(_environment_differences(table))
+    nodes = [_node("data", name, digest, dvc_digest(root / name)) for name, digest in table["outputs"].items()]
+    recorded = {"processor": table["processor"], **table["libraries"]}
+    current = {"processor": processor_name(), **library_versions()}
+    changed = {name: value for name, value in current.items() if recorded.get(name) != value}
+    environment = "; ".join(f"{name} {recorded.get(name)} there, {value} here" for name, value in changed.items())
     for name, digest in table["networks"].items():
         digest_here = payload_digest(root / name) if (root / name).is_file() else None
-        node = _node("checkpoint", root, name, digest, digest_here)
+        node = _node("checkpoint", name, digest, digest_here)
         is_excused = node.status == "changed" and environment
         nodes.append(Node("checkpoint", name, "recorded", environment) if is_excused else node)
     return nodes
 
 
-def _node(kind: Any, root: Path, name: str, expected: str | None, digest_here: str | None) -> Node:
+def _node(kind: Kind, name: str, expected: str, digest_here: str | None) -> Node:
     if digest_here is None:
         return Node(kind, name, "missing", "in the table, but not here")
-    return (
-        Node(kind, name, "same") if digest_here == expected else Node(kind, name, "changed", "differs from the table")
-    )
-
-
-def _environment_differences(table: dict[str, Any]) -> list[str]:
-    current = {"processor": processor_name(), **library_versions()}
-    recorded = {"processor": table["processor"], **table["libraries"]}
-    return [
-        f"{name} {recorded.get(name)} there, {value} here"
-        for name, value in current.items()
-        if recorded.get(name) != value
-    ]
-
-
-def _networks(root: Path, profile: str) -> list[str]:
-    paths = (root / "checkpoints" / profile).rglob("*.safetensors")
-    return sorted(path.relative_to(root).as_posix() for path in paths)
+    is_same = digest_here == expected
+    return Node(kind, name, "same" if is_same else "changed", "" if is_same else "differs from the table")

@@ -8,7 +8,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from itertools import accumulate
@@ -52,7 +52,7 @@ class SourceTree:
         self._sources: dict[str, Path | None] = {}
         self._imports: dict[str, tuple[str, ...]] = {}
         self._data: dict[str, list[tuple[str, Path]]] = {}
-        self._digests: dict[Path, str] = {}
+        self._digest = cache(sha256_file)
 
     def closure(self, start: Iterable[str], chosen: Mapping[str, Iterable[Choice]]) -> dict[str, str]:
         """SHA-256 of each file in the import closure, by its path as the import system sees it.
@@ -77,10 +77,9 @@ class SourceTree:
         """Write the cache of parsed imports if it has grown; a read-only folder is not an error."""
         path = self._root / CACHED_IMPORTS
         if path.parent.is_dir() and not self._parsed_imports.keys() <= self._cached_imports.keys():
+            imports = self._cached_imports | self._parsed_imports
             with suppress(OSError):
-                write_whole(
-                    path, json.dumps({"scanner": _scanner(), "imports": self._cached_imports | self._parsed_imports})
-                )
+                write_whole(path, json.dumps({"scanner": sha256_file(__file__), "imports": imports}))
 
     def modules_below(self, package: str) -> list[str]:
         """The names of all modules in a package, sorted; empty if there is no such folder."""
@@ -166,11 +165,6 @@ class SourceTree:
     def _key(self, name: str, source: Path) -> str:
         return f"{name.replace('.', '/')}{'/__init__' if source.name == '__init__.py' else ''}.py"
 
-    def _digest(self, path: Path) -> str:
-        if path not in self._digests:
-            self._digests[path] = sha256_file(path)
-        return self._digests[path]
-
     def _picked(self, choices: Iterable[Choice]) -> Iterator[tuple[str, Path]]:
         for choice in choices:
             if folder := self._folder(choice.package):
@@ -205,17 +199,10 @@ def _read_imports(path: Path) -> dict[str, list[Statement]]:
     """The cached imports by the digest of the source file; empty if another version of this module wrote them."""
     try:
         values = json.loads(path.read_bytes())
-        imports = values["imports"] if values["scanner"] == _scanner() else {}
-        return {
-            digest: [(base, int(level), list(names)) for base, level, names in statements]
-            for digest, statements in imports.items()
-        }
+        imports = values["imports"].items() if values["scanner"] == sha256_file(__file__) else ()
+        return {digest: [(base, int(level), list(names)) for base, level, names in found] for digest, found in imports}
     except (OSError, ValueError, TypeError, AttributeError, KeyError):
         return {}
-
-
-def _scanner() -> str:
-    return sha256_file(__file__)
 
 
 def _imports(tree: ast.AST) -> Iterator[Statement]:

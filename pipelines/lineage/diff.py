@@ -15,12 +15,11 @@ def differences(root: Path | None, first: dict[str, Any], second: dict[str, Any]
     """The causes, one line each; empty if the records are equal."""
     pairs = _paired(first.get("stages", {}), second.get("stages", {}))
     causes = [line for name, (one, other) in pairs.items() for line in _stage_differences(name, one, other)]
-    causes += _seed(first, second)
-    causes += _facts(first, second)
-    causes += _libraries(first.get("libraries", {}), second.get("libraries", {}))
+    causes += _seed(first, second) + _facts(first, second)
+    libraries = value_changes(first.get("libraries", {}), second.get("libraries", {}))
+    causes += [f"library {change.replace(': ', ' ', 1)}" for change in libraries]
     causes += _raw(raw_sources(root, first), raw_sources(root, second))
-    causes = list(dict.fromkeys(causes))
-    return causes or _unexplained(first, second, pairs)
+    return list(dict.fromkeys(causes)) or _unexplained(first, second, pairs)
 
 
 def _paired(first: dict[str, Any], second: dict[str, Any]) -> dict[str, tuple[dict | None, dict | None]]:
@@ -47,29 +46,24 @@ def _params(stage: str, one: dict[str, Any], other: dict[str, Any]) -> list[str]
 
 
 def _code(one: dict[str, str], other: dict[str, str]) -> list[str]:
-    changes = {path: _change(one.get(path), other.get(path)) for path in sorted({*one, *other})}
-    return [f"{'setting' if ' ' in path else 'code'} {path}: {word}" for path, word in changes.items() if word]
+    return [f"{'setting' if ' ' in path else 'code'} {change}" for path, change in _changes(one, other).items()]
 
 
-def _change(one: Any, other: Any) -> str:
-    """How the second value differs from the first."""
-    if one == other:
-        return ""
-    return "only in the first" if other is None else "only in the second" if one is None else "differs"
+def _changes(one: dict[str, Any], other: dict[str, Any]) -> dict[str, str]:
+    """How the second value of each key differs from the first, if it does, as ``key: words``, by key."""
+    words = {}
+    for key in sorted({*one, *other}):
+        first, second = one.get(key), other.get(key)
+        if first != second:
+            only = "only in the first" if second is None else "only in the second"
+            words[key] = f"{key}: {only if None in (first, second) else 'differs'}"
+    return words
 
 
 def _manifests(one: dict, other: dict) -> list[str]:
     """Differences of manifests, the inputs that no stage writes."""
-    inputs = (
-        {path: digest for path, digest in record["inputs"].items() if path.startswith("manifests/")}
-        for record in (one, other)
-    )
-    first, second = inputs
-    return [
-        f"manifest {path}: {word}"
-        for path in sorted({*first, *second})
-        if (word := _change(first.get(path), second.get(path)))
-    ]
+    changes = _changes(one["inputs"], other["inputs"])
+    return [f"manifest {change}" for path, change in changes.items() if path.startswith("manifests/")]
 
 
 def _seed(first: dict[str, Any], second: dict[str, Any]) -> list[str]:
@@ -94,25 +88,14 @@ def _encoder_param(record: dict[str, Any]) -> Any:
     return next((values.get("encoder") for values in params if isinstance(values, dict)), None)
 
 
-def _libraries(one: dict[str, str], other: dict[str, str]) -> list[str]:
-    return [f"library {change.replace(': ', ' ', 1)}" for change in value_changes(one, other)]
-
-
 def _raw(one: list[RawSource], other: list[RawSource]) -> list[str]:
     """Raw files that differ; if none do, clips that only one record has."""
-    first, second = (
-        {path: digest for source in sources for path, digest in source.digests.items()} for sources in (one, other)
-    )
-    changes = {path: _change(first.get(path), second.get(path)) for path in sorted({*first, *second})}
-    changed = [f"raw file {path}: {word}" for path, word in changes.items() if word]
-    if changed:
-        return changed
-    first_clips, second_clips = (
-        {clip.clip_id for source in sources for clip in source.clips} for sources in (one, other)
-    )
-    return [f"clip {clip}: only in the first" for clip in sorted(first_clips - second_clips)] + [
-        f"clip {clip}: only in the second" for clip in sorted(second_clips - first_clips)
-    ]
+    first, second = (dict(item for source in sources for item in source.digests.items()) for sources in (one, other))
+    if changes := _changes(first, second):
+        return [f"raw file {change}" for change in changes.values()]
+    clips, others = ({clip.clip_id for source in sources for clip in source.clips} for sources in (one, other))
+    only_first = [f"clip {clip}: only in the first" for clip in sorted(clips - others)]
+    return only_first + [f"clip {clip}: only in the second" for clip in sorted(others - clips)]
 
 
 def _unexplained(

@@ -1,10 +1,11 @@
 """SHA-256 digests of files, folders and JSON values."""
 
+import re
 from pathlib import Path
 
 from hoidata.files import canonical_json, sha256_bytes, sha256_file
 
-COMPILED = {"__pycache__"}
+_NOISE = re.compile(r"\.|__pycache__$")
 
 
 def path_digest(path: Path) -> str | None:
@@ -16,13 +17,9 @@ def path_digest(path: Path) -> str | None:
         return sha256_file(path)
     if not path.is_dir():
         return None
-    files = sorted(item for item in path.rglob("*") if item.is_file() and not _is_noise(item.relative_to(path)))
-    lines = [f"{sha256_file(item)}  {item.relative_to(path).as_posix()}\n" for item in files]
-    return sha256_bytes("".join(lines).encode())
-
-
-def _is_noise(path: Path) -> bool:
-    return path.suffix == ".pyc" or any(part in COMPILED or part.startswith(".") for part in path.parts)
+    names = (item.relative_to(path) for item in sorted(path.rglob("*")) if item.is_file())
+    files = (name for name in names if name.suffix != ".pyc" and not any(map(_NOISE.match, name.parts)))
+    return sha256_bytes("".join(f"{sha256_file(path / name)}  {name.as_posix()}\n" for name in files).encode())
 
 
 def value_digest(value: object) -> str:

@@ -38,9 +38,9 @@ def steps(tree: Node, record: dict[str, Any]) -> list[Step]:
     for name in _latest_first(record):
         stage = record["stages"][name]
         outputs = {tree.name: tree.digest} if name == last else _with(algorithm, stage.get("outputs", {}))
-        inputs = _with(algorithm, stage["inputs"])
-        code_digest = value_digest(stage["code"])
-        runs.append(Step(name, stage["params"], code_digest, inputs=inputs, outputs=outputs))
+        runs.append(
+            Step(name, stage["params"], value_digest(stage["code"]), _with(algorithm, stage["inputs"]), outputs)
+        )
     return runs
 
 
@@ -107,23 +107,14 @@ def prov(tree: Node, record: dict[str, Any]) -> dict[str, Any]:
         code = {_qualified("code", step.code_digest): ""} if step.code_digest else {}
         used = {_qualified("file", path): digest for path, digest in step.inputs.items()} | code
         generated = {_qualified("file", path): digest for path, digest in step.outputs.items()}
-        document["entity"] |= {
-            name: {"hoi:digest": digest} if digest else {} for name, digest in (used | generated).items()
-        }
-        links = (
-            ("used", used, "prov:activity", "prov:entity"),
-            ("wasGeneratedBy", generated, "prov:activity", "prov:entity"),
-        )
-        for relation, entities, activity_key, entity_key in links:
+        digests = (used | generated).items()
+        document["entity"] |= {name: {"hoi:digest": digest} if digest else {} for name, digest in digests}
+        for relation, entities in (("used", used), ("wasGeneratedBy", generated)):
             for name in entities:
-                document[relation][f"_:{relation}{len(document[relation])}"] = {
-                    activity_key: activity,
-                    entity_key: name,
-                }
-        document["wasAssociatedWith"][f"_:by{len(document['activity'])}"] = {
-            "prov:activity": activity,
-            "prov:agent": "hoi:hoidata",
-        }
+                link = f"_:{relation}{len(document[relation])}"
+                document[relation][link] = {"prov:activity": activity, "prov:entity": name}
+        association = {"prov:activity": activity, "prov:agent": "hoi:hoidata"}
+        document["wasAssociatedWith"][f"_:by{len(document['activity'])}"] = association
     return document
 
 

@@ -64,16 +64,13 @@ def read_graph(root: Path) -> dict[str, Stage]:
 def written_graph(root: Path) -> dict[str, Stage]:
     """The result of ``read_graph`` in a tenth of the time; uses DVC only for keys that this module does not know."""
     params = read_file(root / "params.yaml")
+    files = (root / "dvc.yaml", *sorted(root.glob("models/*/dvc.yaml")), *root.glob("pipelines/dvc.yaml"))
     try:
-        stages = [stage for file in _graph_files(root) for stage in _written(root, file, params)]
+        names = [path.relative_to(root).as_posix() for path in files]
+        stages = [stage for name in names for stage in _written(root, name, params)]
     except (BadInput, ValueError, TypeError, AttributeError, KeyError, OSError):
         return read_graph(root)
     return {stage.name: stage for stage in stages}
-
-
-def _graph_files(root: Path) -> list[str]:
-    files = (root / "dvc.yaml", *sorted(root.glob("models/*/dvc.yaml")), *root.glob("pipelines/dvc.yaml"))
-    return [path.relative_to(root).as_posix() for path in files]
 
 
 def _written(root: Path, file: str, params: dict[str, Any]) -> Iterator[Stage]:
@@ -127,8 +124,5 @@ def _stage(root: Path, stage: Any) -> Stage:
     name = stage.name if file == "dvc.yaml" else f"{file}:{stage.name}"
     paths = [dep for dep in stage.deps if not hasattr(dep, "params")]
     params = [key for dep in stage.deps if hasattr(dep, "params") for key in dep.params]
-    return Stage(name, _relative(root, paths), tuple(params), _relative(root, stage.outs))
-
-
-def _relative(root: Path, items: list[Any]) -> tuple[str, ...]:
-    return tuple(Path(item.fs_path).relative_to(root).as_posix() for item in items)
+    deps, outs = ([Path(item.fs_path).relative_to(root).as_posix() for item in items] for items in (paths, stage.outs))
+    return Stage(name, tuple(deps), tuple(params), tuple(outs))

@@ -36,11 +36,7 @@ def lock_files(root: Path) -> list[str]:
 
 
 def read_locks(root: Path, stage: str = "") -> dict[str, Locked]:
-    """The last run of each stage by name; empty before the first run.
-
-    Args:
-        stage: reads only the lock file that has this stage, which is faster; "" reads all.
-    """
+    """The last run of each stage, or, faster, of those in the lock file of ``stage``; empty before the first run."""
     file = stage.rpartition(":")[0].removesuffix("yaml") + "lock" if ":" in stage else "dvc.lock"
     return parse_locks({name: (root / name).read_bytes() for name in lock_files(root) if not stage or name == file})
 

@@ -43,10 +43,6 @@ class Manifest:
     def synthetic(self) -> bool:
         return self.source == "generated"
 
-    @property
-    def by_path(self) -> dict[str, SourceFile]:
-        return {entry.path: entry for entry in self.files}
-
     def with_files(self, files: tuple[SourceFile, ...]) -> "Manifest":
         return replace(self, present=True, files=files)
 
@@ -64,12 +60,10 @@ def read_manifest(path: Path) -> Manifest:
         raise BadInput(path, f"schema {SCHEMA}", "another one", REMEDY)
     try:
         files = tuple(SourceFile(**entry) for entry in values.pop("files", ()))
+        if {(type(file.path), type(file.size), type(file.sha256)) for file in files} - {(str, int, str)}:
+            raise TypeError("other types of values")
     except TypeError as error:
         raise BadInput(path, "files with path, size and sha256", str(error), REMEDY) from error
-    if not all(
-        type(file.size) is int and isinstance(file.path, str) and isinstance(file.sha256, str) for file in files
-    ):
-        raise BadInput(path, "files with path, size and sha256", "other types of values", REMEDY)
     try:
         return replace(build_config(Manifest, values, str(path)), files=files)
     except BadInput as error:
@@ -99,21 +93,11 @@ def absent_manifest(adapter: Adapter) -> Manifest:
 
 
 # The hand model of a profile without scanned MANO files.
-ABSENT_HAND = Manifest(
-    dataset="hand",
-    present=False,
-    source="files",
-    licence="MANO: non-commercial research licence",
-    where_to_register="https://mano.is.tue.mpg.de",
-)
+ABSENT_HAND = Manifest("hand", False, "files", "MANO: non-commercial research licence", "https://mano.is.tue.mpg.de")
 
 
 def scan_files(root: Path, parts: Sequence[DatasetPart] | None = None) -> tuple[SourceFile, ...]:
-    """Hash all raw files below ``root`` except images, videos and archives.
-
-    Args:
-        parts: restricts the scan to files of these parts (``Adapter.parts``); None scans all files.
-    """
+    """Hash all raw files of ``parts`` (None: all) below ``root`` except images, videos and archives."""
     patterns = ["**"] if parts is None else [pattern for part in parts for pattern in part.patterns]
     tree = RawTree(root)
     for folder, names in _folders(root, "", [tuple(pattern.split("/")) for pattern in patterns]):
@@ -126,24 +110,18 @@ def scan_files(root: Path, parts: Sequence[DatasetPart] | None = None) -> tuple[
 
 
 def _folders(root: Path, folder: str, patterns: list[tuple[str, ...]]) -> Iterator[tuple[str, list[str]]]:
-    """All folders below root, as relative paths, with the sorted names of their data files that match a pattern.
+    """All folders at and below ``folder``, relative to root, with the sorted names of data files that match a pattern.
 
-    Args:
-        folder: the folder to walk, relative to root.
-        patterns: the remaining path segments of each glob pattern; ``**`` matches everything below.
+    ``patterns`` has the remaining path segments of each glob pattern; ``**`` matches everything below.
     """
     entries = sorted(os.scandir(root / folder), key=lambda entry: entry.name)
     entries = [entry for entry in entries if not entry.name.startswith(".")]
     files = [entry.name for entry in entries if entry.is_file() and not NEVER_READ.search(entry.name)]
-    yield (
-        folder,
-        [name for name in files if any(len(segments) == 1 and _fits(name, segments[0]) for segments in patterns)],
-    )
+    last_segments = [segments[0] for segments in patterns if len(segments) == 1]
+    yield folder, [name for name in files if any(_fits(name, segment) for segment in last_segments)]
     for entry in entries:
-        remaining = [
-            segments if segments[0] == "**" else segments[1:] for segments in patterns if _fits(entry.name, segments[0])
-        ]
-        remaining = [segments for segments in remaining if segments]
+        fitting = (segments for segments in patterns if _fits(entry.name, segments[0]))
+        remaining = [rest for segments in fitting if (rest := segments if segments[0] == "**" else segments[1:])]
         # A link to one of its parent folders would recurse forever.
         is_recursive = entry.is_symlink() and (root / folder).resolve().is_relative_to(Path(entry.path).resolve())
         if remaining and entry.is_dir() and not is_recursive:
@@ -173,12 +151,8 @@ class Difference:
 
 
 def verify_files(root: Path, manifest: Manifest, parts: Sequence[DatasetPart] | None = None) -> list[Difference]:
-    """The differences between the files below ``root`` and the manifest.
-
-    Args:
-        parts: the same parts as for ``scan_files``.
-    """
-    listed, present = manifest.by_path, {entry.path: entry for entry in scan_files(root, parts)}
+    """The differences between the files below ``root`` and the manifest; ``parts`` as for ``scan_files``."""
+    listed, present = ({entry.path: entry for entry in files} for files in (manifest.files, scan_files(root, parts)))
     differences = [Difference(path, "missing") for path in listed if path not in present]
     differences += [Difference(path, "unlisted") for path in present if path not in listed]
     both = listed.keys() & present.keys()

@@ -3,6 +3,8 @@
 It contains no time, host, user or commit, so that equal inputs give equal bytes.
 """
 
+from collections.abc import Callable
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,8 +23,7 @@ LIBRARIES = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl"
 def build_provenance(root: Path, stage_name: str, facts: dict[str, Any]) -> dict[str, Any]:
     """The provenance of the output that a stage is about to write.
 
-    It records the stage and all upstream stages, with the values of their params and the digests of code, inputs and
-    outputs, and the raw files and frames of the clips.
+    It has params and digests of code, inputs and outputs of all stages upstream, and raw files and frames of the clips.
 
     Args:
         facts: of the stage itself: model, config, seed, clips by subset, synthetic.
@@ -30,9 +31,9 @@ def build_provenance(root: Path, stage_name: str, facts: dict[str, Any]) -> dict
     graph = written_graph(root)
     if stage_name not in graph:
         raise BadInput("dvc.yaml", f"a stage named {stage_name}", f"{len(graph)} others", "check params.yaml")
-    params, digest_cache = read_params(root), {}
+    params, digest = read_params(root), cache(lambda path: path_digest(root / path))
     upstream = _upstream_stages(graph, stage_name)
-    stages = {name: _record(root, graph[name], params, digest_cache) for name in upstream}
+    stages = {name: _record(root, graph[name], params, digest) for name in upstream}
     stages[stage_name].pop("outputs")
     return {
         "schema": SCHEMA,
@@ -63,18 +64,12 @@ def _upstream_stages(graph: dict[str, Stage], name: str) -> list[str]:
     return order
 
 
-def _record(root: Path, stage: Stage, params: dict[str, Any], digest_cache: dict[str, str | None]) -> dict[str, Any]:
-    def digests(paths: tuple[str, ...]) -> dict[str, str | None]:
-        for path in paths:
-            if path not in digest_cache:
-                digest_cache[path] = path_digest(root / path)
-        return {path: digest_cache[path] for path in sorted(paths)}
-
+def _record(root: Path, stage: Stage, params: dict[str, Any], digest: Callable[[str], str | None]) -> dict[str, Any]:
     return {
         "params": {key: look_up(params, key) for key in sorted(stage.params)},
         "code": {path: digest for file in stage.code for path, digest in read_json(root / file).items()},
-        "inputs": digests(stage.data),
-        "outputs": digests(stage.outs),
+        "inputs": {path: digest(path) for path in sorted(stage.data)},
+        "outputs": {path: digest(path) for path in sorted(stage.outs)},
     }
 
 

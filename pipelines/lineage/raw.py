@@ -9,6 +9,7 @@ from hoidata.errors import BadInput
 from hoidata.files.written import REMEDY, check_written, read_json
 
 SEQUENCES = "meta/sequences.parquet"
+COLUMNS = ["clip_id", "subject", "object", "other_objects", "first_source_frame", "last_source_frame", "source_files"]
 
 
 @dataclass(frozen=True)
@@ -67,9 +68,7 @@ def read_raw(root: Path, store: str, clip_ids: set[str] | None = None) -> RawSou
         return None
     info = read_json(folder / "meta/info.json")
     files = _rows(folder / "meta/files.parquet", ["path", "sha256"])
-    frames = ["first_source_frame", "last_source_frame"]
-    columns = ["clip_id", "subject", "object", "other_objects", *frames, "source_files"]
-    rows = _rows(folder / SEQUENCES, columns)
+    rows = _rows(folder / SEQUENCES, COLUMNS)
     clips = [_clip(values, files) for values in rows if clip_ids is None or values["clip_id"] in clip_ids]
     used = {path for clip in clips for path in clip.files}
     digests = {file["path"]: file["sha256"] for file in files if file["path"] in used}
@@ -89,10 +88,9 @@ def _rows(path: Path, columns: list[str]) -> list[dict[str, Any]]:
 
 
 def _clip(values: dict[str, Any], files: list[dict[str, Any]]) -> RawClip:
-    frames = (values["first_source_frame"], values["last_source_frame"])
-    paths = tuple(files[index]["path"] for index in values["source_files"])
-    objects = (values["object"], *values["other_objects"])
-    return RawClip(values["clip_id"], values["subject"], objects, frames=frames, files=paths)
+    clip_id, subject, main_object, other_objects, first, last, numbers = (values[name] for name in COLUMNS)
+    paths = tuple(files[index]["path"] for index in numbers)
+    return RawClip(clip_id, subject, (main_object, *other_objects), frames=(first, last), files=paths)
 
 
 def raw_sources(root: Path | None, record: dict[str, Any]) -> list[RawSource]:
@@ -113,13 +111,9 @@ def clips_of(record: dict[str, Any]) -> set[str]:
 
 def upstream_stores(record: dict[str, Any]) -> list[str]:
     """The inputs and outputs below ``data/`` of all stages of a record; the stores of recorded clips are among them."""
-    paths = (
-        path
-        for stage in record.get("stages", {}).values()
-        for key in ("inputs", "outputs")
-        for path in stage.get(key, ())
-    )
-    return sorted({path for path in paths if path.startswith("data/")})
+    stages = record.get("stages", {}).values()
+    paths = {path for stage in stages for key in ("inputs", "outputs") for path in stage.get(key, ())}
+    return sorted(path for path in paths if path.startswith("data/"))
 
 
 @dataclass(frozen=True)

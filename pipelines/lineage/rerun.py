@@ -18,19 +18,15 @@ from pipelines.lineage.targets import WEIGHTS, Target
 def rerun(root: Path, target: Target, commit: str = "HEAD") -> tuple[str, str]:
     """The digest of a checkpoint's weights, and that of the same stage run again with the code of a commit.
 
-    The clone gets this project's inputs and profile, and the settings of the commit.
-
-    Raises:
-        BadInput: the target is not a checkpoint of this project.
-        HoidataError: the stage fails.
+    The clone gets this project's inputs and profile, and the settings of the commit. Raises BadInput if the target is
+    not a checkpoint of this project, HoidataError if the stage fails.
     """
     stage = target.record.get("stage", "")
     out = Path(target.name).parent
     arguments = _arguments(root, out.as_posix(), stage)
     if target.kind != "checkpoint" or not arguments:
-        raise BadInput(
-            target.name, "a checkpoint of a stage of this project", target.kind, "name one below checkpoints/"
-        )
+        remedy = "name one below checkpoints/"
+        raise BadInput(target.name, "a checkpoint of a stage of this project", target.kind, remedy)
     with TemporaryDirectory(prefix="hoidata-rerun-") as folder:
         clone = Path(folder) / "clone"
         _run(root, "git", "clone", "--quiet", "--no-hardlinks", str(root.resolve()), str(clone))
@@ -56,9 +52,8 @@ def _arguments(root: Path, out: str, stage: str) -> list[str]:
 
 
 def _resolved(root: Path, commit: str) -> str:
-    result = subprocess.run(
-        ["git", "rev-parse", "--verify", f"{commit}^{{commit}}"], cwd=root, capture_output=True, text=True
-    )
+    command = ["git", "rev-parse", "--verify", f"{commit}^{{commit}}"]
+    result = subprocess.run(command, cwd=root, capture_output=True, text=True)
     if result.returncode:
         raise BadInput(commit, "a commit of this project", "none", "name one that `git log` shows")
     return result.stdout.strip()
@@ -83,9 +78,8 @@ def _link_inputs(root: Path, clone: Path, out: Path) -> None:
 def _run(folder: Path, *command: str) -> None:
     environment = {**os.environ, "PYTHONPATH": str(folder.resolve())}
     end_with_caller = partial(end_with_parent, os.getpid())
-    result = subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, env=environment, preexec_fn=end_with_caller
-    )
+    run = partial(subprocess.run, capture_output=True, text=True)
+    result = run(command, cwd=folder, env=environment, preexec_fn=end_with_caller)
     if result.returncode:
         lines = (result.stderr or result.stdout).strip().splitlines()
         raise HoidataError(f"{' '.join(command)}: exit code {result.returncode}: {lines[-1] if lines else ''}")

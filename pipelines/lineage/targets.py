@@ -44,13 +44,9 @@ class Target:
 
 
 def find_target(root: Path | None, path_or_digest: str, here: Path | None = None) -> Target:
-    """The file with a path (relative to ``here``) or a digest.
+    """The file with a path (relative to ``here``), or a digest that begins with these eight or more characters.
 
-    Args:
-        path_or_digest: a path, or the first eight or more characters of a digest.
-
-    Raises:
-        BadInput: there is no such file, or no record of its inputs.
+    Raises BadInput if there is no such file, or no record of its inputs.
     """
     path = (here or Path()) / path_or_digest
     if path.exists():
@@ -100,16 +96,10 @@ def _checkpoint(root: Path | None, path: Path, name: str) -> Target:
     target = Target("checkpoint", name, record)
     if fault:
         return replace(target, status="tampered", note=f"the {fault} differ from their checksum")
-    if root is None:
-        return target
-    recorded_in = _recorded_in(root, path, record["stage"])
-    if recorded_in is None:
-        return target
-    return replace(
-        target,
-        status="same" if recorded_in else "orphan",
-        note=recorded_in or "not in dvc.lock, neither the present nor a committed one",
-    )
+    recorded_in = _recorded_in(root, path, record["stage"]) if root else None
+    if recorded_in == "":
+        return replace(target, status="orphan", note="not in dvc.lock, neither the present nor a committed one")
+    return replace(target, note=recorded_in or "")
 
 
 def _recorded_in(root: Path, path: Path, stage: str) -> str | None:
@@ -161,11 +151,8 @@ def lock_record(root: Path, locks: dict[str, Locked], stage: str) -> dict[str, A
     """The entries of a stage and all upstream stages in dvc.lock, in the form of a checkpoint's provenance."""
     producers, order = {out: lock.name for lock in locks.values() for out in lock.outs}, [stage]
     for name in order:
-        order += [
-            producers[path]
-            for path in locks[name].deps
-            if path in producers and producers[path] not in (*order, "code")
-        ]
+        inputs = (producers[path] for path in locks[name].deps if path in producers)
+        order += [producer for producer in inputs if producer not in (*order, "code")]
     stages = {name: _lock_stage(root, locks[name]) for name in dict.fromkeys(order)}
     return {"schema": SCHEMA_LOCK, "stage": stage, "stages": stages}
 
@@ -174,8 +161,7 @@ def _lock_stage(root: Path, lock: Locked) -> dict[str, Any]:
     code = {path: digest for path, digest in lock.deps.items() if path.startswith("code/")}
     files: dict[str, str] = {}
     for path, digest in code.items():
-        is_current = dvc_digest(root / path) == digest
-        files |= read_json(root / path) if is_current else {path: digest}
+        files |= read_json(root / path) if dvc_digest(root / path) == digest else {path: digest}
     inputs = {path: digest for path, digest in lock.deps.items() if path not in code}
     return {"params": lock.params, "code": files, "inputs": inputs, "outputs": lock.outs}
 
@@ -183,24 +169,17 @@ def _lock_stage(root: Path, lock: Locked) -> dict[str, Any]:
 def _target_of_digest(root: Path, digest: str) -> Target:
     """File with a digest: SHA-256 of a checkpoint or its weights, or MD5 of an output in dvc.lock or its history."""
     for path in sorted(root.glob("checkpoints/**/*.safetensors")):
-        if any(
-            candidate.startswith(digest)
-            for candidate in (payload_digest(path), sha256_file(path), dvc_digest(path) or "")
-        ):
+        digests = (payload_digest(path), sha256_file(path), dvc_digest(path) or "")
+        if any(one.startswith(digest) for one in digests):
             return _target_at(root, path)
     locks = read_locks(root)
     for lock in locks.values():
         if path := _out_with(root, lock, digest):
-            return (
-                _target_at(root, root / path)
-                if (root / path).exists()
-                else _missing_target(root, locks, lock.name, path)
-            )
-    history = History(root)
-    files = _possible_locks(root)
+            is_there = (root / path).exists()
+            return _target_at(root, root / path) if is_there else _missing_target(root, locks, lock.name, path)
+    history, files = History(root), _possible_locks(root)
     if commit := history.commit_with(digest, files):
-        texts = {file: text for file in files if (text := history.text(commit, file))}
-        locks_then = parse_locks(texts)
+        locks_then = parse_locks({file: text for file in files if (text := history.text(commit, file))})
         for lock in locks_then.values():
             if path := _out_with(root, lock, digest):
                 note = f"recorded in commit {commit[:10]}; the file has changed since"

@@ -1,18 +1,14 @@
 """`hoidata lineage uses`: the outputs that use a raw file, subject, object or clip, and must go if it is withdrawn."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePath
 
 from hoidata.errors import BadInput
 from pipelines.lineage.locks import Locked, read_locks
 from pipelines.lineage.provenance import read_provenance
-from pipelines.lineage.raw import RawClip, RawSource, clips_of, raw_sources, read_raw
+from pipelines.lineage.raw import SEQUENCES, RawClip, RawSource, clips_of, raw_sources, read_raw
 from pipelines.lineage.targets import WEIGHTS
 from pipelines.stages.base import empty_reason
-
-_STORE = "clips"
 
 
 @dataclass(frozen=True)
@@ -35,9 +31,10 @@ def uses(root: Path, source: str) -> list[Use]:
         source: the path of a raw file or its end, a subject, an object, or a clip id.
     """
     locks = read_locks(root)
-    stores = {path: read_raw(root, path) for path in _stores(root, locks)}
-    matching = {path: _matching_clips(store, source) for path, store in stores.items() if store is not None}
-    clips = {path: ids for path, ids in matching.items() if ids}
+    written = {path for lock in locks.values() for path in lock.outs if PurePath(path).match("data/*/*/clips")}
+    here = {path.parent.parent.relative_to(root).as_posix() for path in root.glob(f"data/*/*/clips/{SEQUENCES}")}
+    stores = {path: read_raw(root, path) for path in sorted(written | here)}
+    clips = {path: ids for path, store in stores.items() if store and (ids := _matching_clips(store, source))}
     used_by = dict(clips)  # clip ids by the path of each output that uses them
     outputs = [Use("store", path, _count(ids)) for path, ids in clips.items()]
     checkpoints = (*root.glob(f"checkpoints/**/{WEIGHTS}"), *root.glob(f"evaluators/**/{WEIGHTS}"))
@@ -46,22 +43,13 @@ def uses(root: Path, source: str) -> list[Use]:
         if ids := _clips_of_checkpoint(root, checkpoint, source):
             used_by[name] = ids
             outputs.append(Use("checkpoint", name, _count(ids)))
-    for stage in _samples_first(locks):
+    # Stages that write samples first, since all others may read these.
+    for stage in sorted(locks.values(), key=lambda lock: not any(path.startswith("samples/") for path in lock.outs)):
         outputs += _derived(root, stage, clips, used_by)
     if not outputs:
         expected = "a raw file, subject, object or clip that an output of this project uses"
         raise BadInput(source, expected, "none", "correct it")
     return outputs
-
-
-def _stores(root: Path, locks: dict[str, Locked]) -> list[str]:
-    outs = {
-        path for lock in locks.values() for path in lock.outs if Path(path).name == _STORE and path.startswith("data/")
-    }
-    written = (
-        path.parent.parent.relative_to(root).as_posix() for path in root.glob("data/*/*/clips/meta/sequences.parquet")
-    )
-    return sorted({*outs, *written})
 
 
 def _matching_clips(store: RawSource, source: str) -> set[str]:
@@ -90,12 +78,6 @@ def _clips_of_checkpoint(root: Path, path: Path, source: str) -> set[str]:
     return ids
 
 
-def _samples_first(locks: dict[str, Locked]) -> Iterator[Locked]:
-    """The stages that write samples, then all others, which may read the samples."""
-    yield from (lock for lock in locks.values() if any(path.startswith("samples/") for path in lock.outs))
-    yield from (lock for lock in locks.values() if not any(path.startswith("samples/") for path in lock.outs))
-
-
 def _derived(root: Path, lock: Locked, clips: dict[str, set[str]], used_by: dict[str, set[str]]) -> list[Use]:
     """The outputs of one stage that use the clips; adds them to ``used_by`` for the stages after it."""
     outs = {path: kind for path in lock.outs if (kind := _KINDS.get(path.partition("/")[0])) and path not in used_by}
@@ -117,9 +99,8 @@ _KINDS = {"samples": "sample", "metrics": "metric", "data": "table"}
 
 def _used_at(used_by: dict[str, set[str]], path: str) -> set[str]:
     """The clips that a folder and all below it use (``evaluators/embedded/grab`` has several); none for stores."""
-    return set().union(
-        *(ids for name, ids in used_by.items() if Path(name).is_relative_to(path) and not path.startswith("data/"))
-    )
+    users = [ids for name, ids in used_by.items() if Path(name).is_relative_to(path) and not path.startswith("data/")]
+    return set().union(*users)
 
 
 def _sampled_clips(root: Path, path: str, lock: Locked, recorded: set[str]) -> set[str]:
@@ -130,11 +111,8 @@ def _sampled_clips(root: Path, path: str, lock: Locked, recorded: set[str]) -> s
         return recorded
     import pyarrow.parquet as parquet
 
-    tables = (root / path).rglob("meta/sequences.parquet")
-    sampled: set[Any] = set().union(
-        *(parquet.read_table(table, columns=["sequence"])["sequence"].to_pylist() for table in tables)
-    )
-    return recorded & sampled
+    tables = (parquet.read_table(file, columns=["sequence"]) for file in (root / path).rglob(SEQUENCES))
+    return recorded.intersection(name for table in tables for name in table["sequence"].to_pylist())
 
 
 def _count(ids: set[str]) -> str:
