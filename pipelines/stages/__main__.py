@@ -14,19 +14,8 @@ from hoidata.lifetime import end_with_process, run_interruptibly
 from pipelines.warm import ENVIRONMENT, run_warm
 
 STAGES = (
-    "code",
-    "raw",
-    "convert",
-    "quality",
-    "annotate",
-    "contact",
-    "split",
-    "evaluator",
-    "train",
-    "sample",
-    "controls",
-    "evaluate",
-    "report",
+    *("code", "raw", "convert", "quality", "annotate", "contact", "split"),
+    *("evaluator", "train", "sample", "controls", "evaluate", "report"),
 )
 
 
@@ -42,12 +31,10 @@ def main() -> int:
             stream.reconfigure(errors="backslashreplace")  # a file name need not be UTF-8
     parser = argparse.ArgumentParser(prog="python -m pipelines.stages")
     parser.add_argument("stage", choices=STAGES)
-    parser.add_argument(
-        "--profile", default="", help="must be the profile that params.yaml chooses, whose settings are used"
-    )
-    parser.add_argument("--dataset", default="")
-    parser.add_argument("--model", default="")
-    parser.add_argument("--family", default="")
+    help_on_profile = "must be the profile that params.yaml chooses, whose settings are used"
+    parser.add_argument("--profile", default="", help=help_on_profile)
+    for name in ("--dataset", "--model", "--family"):
+        parser.add_argument(name, default="")
     options = parser.parse_args()
     if (code := run_warm("pipelines.stages", sys.argv[1:])) is not None:
         return code

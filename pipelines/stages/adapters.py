@@ -41,11 +41,10 @@ def manifest_of(paths: StagePaths) -> Manifest:
     A variant without a manifest has that of its source. An experiment in a temporary copy of the project reads
     uncommitted manifests from the original project.
     """
-    candidates = (paths.manifest, source_paths(paths).manifest)
-    existing = [
-        folder / path for path in candidates for folder in (Path(), machine_folder()) if (folder / path).is_file()
-    ]
-    return read_manifest(existing[0]) if existing else absent_manifest(configured_adapter(paths.dataset))
+    names = (paths.manifest, source_paths(paths).manifest)
+    candidates = (folder / name for name in names for folder in (Path(), machine_folder()))
+    existing = next((path for path in candidates if path.is_file()), None)
+    return read_manifest(existing) if existing else absent_manifest(configured_adapter(paths.dataset))
 
 
 def source_of(name: str) -> str:

@@ -5,8 +5,7 @@ also have settings of params.yaml that DVC cannot track: those of one dataset, w
 that the chosen profile overrides.
 """
 
-from collections.abc import Collection
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -26,18 +25,9 @@ READERS = {
     "hoidata.dataset_folders": ("facts.toml",),
     "hoidata.splits.definitions": ("splits/*.json", "published.json"),
 }
-
-
 # Sections of params.yaml with a key per dataset. DVC cannot depend on such a key, because it may be absent.
 SECTIONS_OF_DATASETS = {"convert": ("convert", "adapters"), "split": ("split",)}
-
-
-@dataclass(frozen=True)
-class Start:
-    """The module where the code of a stage begins."""
-
-    module: str
-    chosen: dict[str, list[Choice]] = field(default_factory=dict)  # run-time choices, by module
+Chosen = dict[str, list[Choice]]  # run-time choices, by module
 
 
 def run(paths: StagePaths) -> None:
@@ -64,51 +54,43 @@ def write_code(root: Path) -> None:
 
 
 def code_today(root: Path, only: Collection[str] | None = None) -> dict[str, dict[str, str]]:
-    """The content of the files of ``code/`` for the present code, by path (``code/convert/grab.json``).
-
-    Args:
-        only: paths of the files to compute; None for all.
-    """
+    """The content of the files of ``code/`` (``only`` these paths, such as ``code/convert/grab.json``), by path."""
     plain = read_file(root / "params.yaml")
     params = chosen_params(plain)
     tree = SourceTree(root, {f"{DATASETS}.{name}": folder for name, folder in outside_folders().items()})
-    starts = {f"{CODE / name}.json": (name, start) for name, start in closures(params, tree).items()}
     contents = {
-        path: tree.closure([start.module], start.chosen)
+        f"{CODE / name}.json": tree.closure([f"pipelines.stages.{name.partition('/')[0]}"], chosen)
         | dataset_settings(params, name)
         | profile_settings(plain, params, name)
-        for path, (name, start) in starts.items()
-        if only is None or path in only
+        for name, chosen in choices_of_stages(params, tree).items()
+        if only is None or f"{CODE / name}.json" in only
     }
     tree.save_imports()
     return contents
 
 
-def closures(params: dict[str, Any], tree: SourceTree) -> dict[str, Start]:
-    """The start module and choices for each file of ``code/``, by its path without suffix."""
-    starts, all_choices = {}, {}
+def choices_of_stages(params: dict[str, Any], tree: SourceTree) -> dict[str, Chosen]:
+    """The run-time choices for each file of ``code/``, by its path without suffix, which begins with the stage."""
+    choices: dict[str, Chosen] = {}
+    common: Chosen = {}  # the choices of all datasets
     for dataset in params["datasets"]:
         chosen = _chosen_by_dataset(tree, dataset)
-        starts |= {f"{stage}/{dataset}": _start(stage, chosen) for stage in STAGES_OF_DATASETS}
-        all_choices = {module: [*all_choices.get(module, ()), *choices] for module, choices in chosen.items()}
+        choices |= {f"{stage}/{dataset}": chosen for stage in STAGES_OF_DATASETS}
+        common = {module: [*common.get(module, ()), *others] for module, others in chosen.items()}
     sizes = [section for section in params["train"].values() if isinstance(section, dict)]
     for network in dict.fromkeys([*NETWORKS, *(name for section in sizes for name in section)]):
-        starts[f"train/{network}"] = _start("train", all_choices | _families(network_modules(network)))
+        choices[f"train/{network}"] = common | _families(network_modules(network))
     for family in dict.fromkeys([*family_names(), *params["families"]]):
-        starts[f"sample/{family}"] = _start("sample", all_choices | _families([family_module(family)]))
+        choices[f"sample/{family}"] = common | _families([family_module(family)])
     controls = (params.get("controls") or {}).get("families") or []
-    starts["controls"] = _start("controls", all_choices | _families([family_module(family) for family in controls]))
-    all_choices |= _families([family_module(family) for family in params["families"]])
-    return starts | {stage: _start(stage, all_choices) for stage in ("evaluator", "evaluate", "report")}
+    choices["controls"] = common | _families(map(family_module, controls))
+    common |= _families(map(family_module, params["families"]))
+    return choices | dict.fromkeys(("evaluator", "evaluate", "report"), common)
 
 
-def _families(modules: list[str]) -> dict[str, list[Choice]]:
+def _families(modules: Iterable[str]) -> Chosen:
     """The choice of ``models.registry``: a new family does not change the digests of the others."""
     return {"models.registry": [Choice(tuple(modules), is_registry=True)]}
-
-
-def _start(stage: str, chosen: dict[str, list[Choice]]) -> Start:
-    return Start(f"pipelines.stages.{stage}", chosen)
 
 
 def dataset_settings(params: dict[str, Any], name: str) -> dict[str, str]:
@@ -123,11 +105,7 @@ def dataset_settings(params: dict[str, Any], name: str) -> dict[str, str]:
 
 
 def profile_settings(plain: dict[str, Any], params: dict[str, Any], name: str) -> dict[str, str]:
-    """The settings of a file's stages, as JSON, if the chosen profile overrides them; else empty.
-
-    Args:
-        name: the file of ``code/``, without suffix.
-    """
+    """The settings of the stages of a file of ``code/``, as JSON, if the chosen profile overrides them; else empty."""
     settings = _settings_read(params, name)
     if settings == _settings_read(plain, name):
         return {}
@@ -146,16 +124,13 @@ def _settings_read(params: dict[str, Any], name: str) -> Any:
     return (section, params.get("sample")) if stage == "controls" else section
 
 
-def _chosen_by_dataset(tree: SourceTree, name: str) -> dict[str, list[Choice]]:
+def _chosen_by_dataset(tree: SourceTree, name: str) -> Chosen:
     """The choices of one dataset: the modules of its adapter, and the files that are read in its folder."""
-
-    def adapter_modules(dataset: str) -> list[str]:
-        return tree.modules_below(f"{DATASETS}.{dataset}") or tree.entry_point_modules("hoidata.adapters", dataset)
-
-    modules = adapter_modules(name)
-    if not modules:  # a variant, such as arctic-whole
-        name = name.partition("-")[0]
-        modules = adapter_modules(name)
-    package = f"{DATASETS}.{name}"
+    package, modules = "", list[str]()
+    for dataset in dict.fromkeys((name, name.partition("-")[0])):  # a variant, such as arctic-whole, has no modules
+        package = f"{DATASETS}.{dataset}"
+        modules = tree.modules_below(package) or tree.entry_point_modules("hoidata.adapters", dataset)
+        if modules:
+            break
     readers = {reader: [Choice(package=package, files=files)] for reader, files in READERS.items()}
     return {f"{DATASETS}.registry": [Choice(tuple(modules))], **readers}

@@ -30,8 +30,7 @@ class EvaluateSettings:
 
 
 def run(paths: StagePaths) -> None:
-    """Write ``<family>.json`` for each family of params.yaml and ``controls/<name>.json`` for each control,
-    and their leading metrics for ``dvc metrics``.
+    """Write ``<family>.json`` and ``controls/<name>.json`` for each family and control, and their leading metrics.
 
     The file of a dataset or family without motions has the reason instead. Metrics of an earlier run are reused if
     their inputs have not changed, so that a new family does not measure the others again.

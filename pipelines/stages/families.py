@@ -1,5 +1,6 @@
 """The families whose motions are sampled and measured for a dataset."""
 
+from itertools import chain
 from typing import Any
 
 from hoidata.errors import BadInput
@@ -30,7 +31,5 @@ def families_of(params: dict[str, Any], dataset: str) -> list[str]:
         if misplaced := [name for name in params["families"] if name in optional]:
             remedy = f"name datasets under {KEY}.{folder} instead, such as {folder}: [{dataset}]"
             raise BadInput("params.yaml: families", f"no family of {KEY}", ", ".join(misplaced), remedy)
-    added = (
-        name for folder, names in OPTIONAL_FAMILIES.items() for name in names if dataset in (chosen.get(folder) or [])
-    )
-    return [*params["families"], *added]
+    added = [names for folder, names in OPTIONAL_FAMILIES.items() if dataset in (chosen.get(folder) or [])]
+    return [*params["families"], *chain(*added)]

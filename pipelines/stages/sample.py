@@ -27,9 +27,8 @@ def sample(paths: StagePaths, params: dict, family: str) -> None:
     from models.registry import load_family
 
     section = dict(params.get("sample") or {})
-    settings = {
-        name: section.pop(name) for name in list(section) if isinstance(section[name], dict) and name != "windows"
-    }
+    names = [name for name, value in section.items() if isinstance(value, dict) and name != "windows"]
+    settings = {name: section.pop(name) for name in names}
     make_repeatable(threads=1)
     counts = sample_family(
         load_family(family),

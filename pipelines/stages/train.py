@@ -1,8 +1,8 @@
 """Stage train: train one network on one dataset, and store its provenance in the checkpoint."""
 
 import tempfile
-from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Mapping
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,21 +10,16 @@ from typing import Any, Literal
 
 from hoidata.annotation.encoders import not_clip_note
 from hoidata.annotation.settings import AnnotationSettings
+from hoidata.errors import BadInput
 from hoidata.files import sha256_file
 from models.registry import load_network
-from pipelines.lineage.graph import producers, written_graph
+from pipelines.lineage.graph import look_up, producers, written_graph
 from pipelines.lineage.provenance import build_provenance
 from pipelines.params import merge_settings, read_file, read_params
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, write_empty
 
-SENTENCE_READERS = (
-    "contact",
-    "length",
-    "diffusion",
-    "mdm",
-    "imos",
-    "t2m-length",
-)  # networks that read sentence features
+# Networks that read sentence features.
+SENTENCE_READERS = ("contact", "length", "diffusion", "mdm", "imos", "t2m-length")
 
 
 @dataclass(frozen=True)
@@ -99,15 +94,9 @@ def full_key(network: str, key: str, path: Path = Path("params.yaml")) -> str:
     values, chosen = read_file(path), load_settings(TrainParams, "train", path)
     profile = ("profiles", str(values.get("profile")))
     sections = [(*top, "train", name, network) for name in (chosen.size, chosen.preset) for top in (profile, ())]
-    for section in sections:
-        if _is_set(values, (*section, *key.split("."))):
-            return ".".join((*section, key))
-    return ".".join((*sections[1], key))
-
-
-def _is_set(values: Any, names: Sequence[str]) -> bool:
-    for name in names:
-        if not isinstance(values, Mapping) or name not in values:
-            return False
-        values = values[name]
-    return True
+    keys = [".".join((*section, key)) for section in sections]
+    for name in keys:
+        with suppress(BadInput):
+            look_up(values, name)
+            return name
+    return keys[1]

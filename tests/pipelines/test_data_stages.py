@@ -29,7 +29,7 @@ from pipelines.params import read_file
 from pipelines.stages import annotate, contact, quality, split
 from pipelines.stages.adapters import ConvertSettings, ensure_manifests, raw_files
 from pipelines.stages.base import StagePaths, empty_reason, load_settings, write_empty
-from pipelines.stages.code import closures, dataset_settings
+from pipelines.stages.code import choices_of_stages, dataset_settings
 from tests.builders import hoi4d
 from tests.builders.clips import jumping
 
@@ -91,9 +91,9 @@ def test_a_variant_has_the_code_of_its_source_and_its_settings_concern_it_alone(
         "datasets": ["arctic", "arctic-whole"],
         "convert": {"adapters": {"arctic-whole": {"clips": "whole"}}},
     }
-    starts = closures(params, SourceTree(PROJECT))
+    choices = choices_of_stages(params, SourceTree(PROJECT))
     for stage in ("raw", "convert", "split"):
-        assert starts[f"{stage}/arctic"] == starts[f"{stage}/arctic-whole"]
+        assert choices[f"{stage}/arctic"] == choices[f"{stage}/arctic-whole"]
     assert dataset_settings(params, "convert/arctic") == {"params.yaml convert.adapters.arctic": "null"}
     assert "whole" in dataset_settings(params, "convert/arctic-whole")["params.yaml convert.adapters.arctic-whole"]
 
