@@ -170,9 +170,8 @@ def stream_files(
 
     Args:
         source: the file, or the address at which a tracker's frames arrive (``models.manipnet.datagrams``).
-        show: called with each predicted pose as a line of JSON, without delay.
+        show: called with each predicted pose as a line of JSON, which is also sent to the address ``to``, if any.
         report: called with the reason why a datagram was refused.
-        to: the address to which poses are sent too, or "".
         in_real_time: push each frame of a file at its recorded time; else without waiting.
     """
     check_new_store(store)
@@ -197,16 +196,13 @@ def stream_files(
 
 
 def _written(animation: Animation, out: Path, store: Path | None) -> WrittenFiles:
-    clip, hands, ghosts = animation.clip, animation.hands, animation.ghosts
-    sides: list[Side] = [
-        side for side, is_generated in zip(SIDES, animation.generated, strict=True) if is_generated.any()
-    ]
-    checks = verdict(clip, hands, sides=sides)
+    clip, hands, ghosts, generated = animation.clip, animation.hands, animation.ghosts, animation.generated
+    checks = verdict(clip, hands, sides=[side for side, frames in zip(SIDES, generated, strict=True) if frames.any()])
     length = ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s")
     paths = write_motions(
         out,
         "animation.html",
-        [MotionFiles(clip, motion_arrays(clip, hands) | {"made": animation.generated}, ghosts=ghosts)],
+        [MotionFiles(clip, motion_arrays(clip, hands) | {"made": generated}, ghosts=ghosts)],
         hands,
         ARRAYS,
         title=clip.clip_id,
@@ -258,16 +254,15 @@ def _from_clip(clip_id: str, options: AnimationOptions, project: ProjectData) ->
         requested = fingers[frames.start - gap.first : frames.stop - gap.first]
         tracks[side] = with_fingers(clip.hands[side], frames, requested, control.wrists[side])
         generated[SIDES.index(side), frames] = True
-    rows = network.rows if network else []
-    rows = [*rows, ("generated", f"{', '.join(sides)}, frames {frames.start} to {frames.stop - 1} of {clip.n_frames}")]
+    generated_words = f"{', '.join(sides)}, frames {frames.start} to {frames.stop - 1} of {clip.n_frames}"
+    rows = [*(network.rows if network else []), ("generated", generated_words)]
     rows += [("method", f"{side}: {_method_words(gaps[side], side in interpolated)}") for side in sides]
     notes = [note for side in sides for note in _lost_notes(side, clip.hands[side], frames)]
     notes += network.notes_on(clip_id) if network else []
     is_synthetic = clip.synthetic or (network is not None and network.is_synthetic)
     ghosts: dict[Side, HandTrack] = {side: clip.hands[side] for side in sides}
     animated = replace(clip, hands=tracks, synthetic=is_synthetic)
-    network_facts = network.facts if network else {}
-    return Animation(animated, generated, ghosts, hands, rows, notes, network_facts, annotated.info)
+    return Animation(animated, generated, ghosts, hands, rows, notes, network.facts if network else {}, annotated.info)
 
 
 def _clip_paths(clip_id: str, project: ProjectData) -> StagePaths:
@@ -300,13 +295,8 @@ def _method_words(gap: Gap, is_interpolated: bool) -> str:
 
 def _lost_notes(side: Side, track: HandTrack, frames: slice) -> list[str]:
     n_lost = int((~track.valid[frames]).sum())
-    if not n_lost:
-        return []
-    n_frames = frames.stop - frames.start
-    return [
-        f"the {side} hand is not tracked in {n_lost} of the {n_frames} frames; "
-        "there its wrist has the pose of the nearest tracked frame"
-    ]
+    note = f"the {side} hand is not tracked in {n_lost} of the {frames.stop - frames.start} frames; "
+    return [note + "there its wrist has the pose of the nearest tracked frame"] if n_lost else []
 
 
 def _predict_all(
@@ -338,8 +328,8 @@ def _played(
 ) -> tuple[list[TrackedFrame], list[dict[Side, np.ndarray]]]:
     """Push frames through a stream; return those that are not late, with times of its clock, and all poses."""
     start: dict[Side, np.ndarray] = {side: hand.rest_rotmats for side, hand in hands.items()}
-    stream, accepted = Stream(predictor, hands, dict.fromkeys(hands, model), start), list[TrackedFrame]()
-    shown: list[dict[Side, np.ndarray]] = []
+    stream = Stream(predictor, hands, dict.fromkeys(hands, model), start)
+    accepted, shown = list[TrackedFrame](), list[dict[Side, np.ndarray]]()
 
     def show_all(poses: list[dict[Side, np.ndarray]]) -> None:
         for pose in poses:
@@ -393,9 +383,7 @@ def _from_tracker(
     fingers = _poses_of_frames(poses, predictor, hands, valid.shape[1])
     clip = clip_of(control, fingers, UPS[options.up], "live", network.is_synthetic)
     generated = valid & np.array([[side in hands] for side in SIDES])
-    tracks: dict[Side, HandTrack] = {
-        side: replace(clip.hands[side], valid=tracked) for side, tracked in zip(SIDES, generated, strict=True)
-    }
+    tracks = {side: replace(clip.hands[side], valid=tracked) for side, tracked in zip(SIDES, generated, strict=True)}
     rows = [*network.rows, ("object", model.name), ("source", source)]
     return Animation(replace(clip, hands=tracks), generated, {}, project.hands, rows, notes, network.facts)
 
@@ -420,8 +408,7 @@ def _from_file(
     fingers |= predict(network.predictor, animated, given.control, control)
     generated[[SIDES.index(side) for side in animated]] = True
     clip = clip_of(control, fingers, trajectories.up or UPS[options.up], path.stem, network.is_synthetic)
-    rows = [*network.rows, ("object", model.name)]
-    return Animation(clip, generated, {}, project.hands, facts=rows, notes=notes, network_facts=network.facts)
+    return Animation(clip, generated, {}, project.hands, [*network.rows, ("object", model.name)], notes, network.facts)
 
 
 def _skipped_hand_notes(trajectories: TrajectoryFile, given: AnimationInput, sides: tuple[Side, ...]) -> list[str]:

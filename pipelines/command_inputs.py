@@ -81,7 +81,7 @@ def write_motion_store(
     The licence is that of ``source``, else that of the networks: only networks of generated clips may be shared.
 
     Args:
-        networks: the facts in the header of a checkpoint; empty without a network.
+        networks: the facts in the header of a checkpoint, if any.
         source: facts of the store of the clip that the motions replace; see ``hoidata.store.info.store_info``.
     """
     if folder is None:
@@ -110,26 +110,16 @@ def mesh_notes(model: ObjectModel) -> list[str]:
     """Notes on repairs of a mesh, and on parts without an inside, where penetration is not prevented."""
     index = surface_index(model)
     note = [] if index.repair_note is None else [f"mesh: {index.repair_note}"]
-    return (
-        note if index.is_solid else [f"{note[0]}; hands are attracted to its surface, but penetration is not prevented"]
-    )
+    risk = "; hands are attracted to its surface, but penetration is not prevented"
+    return note if index.is_solid else [note[0] + risk]
 
 
 def trained_run(
     family: str, networks: Sequence[str], model: str, project: ProjectData
 ) -> tuple[StagePaths, Mapping[str, Any]]:
-    """The first dataset that has all of these networks, or the one that is named.
+    """The dataset ``model``, or for "" the first one that has these networks; facts of the last network's header.
 
-    Args:
-        model: the dataset to use, or "" for the first one that has them.
-        project: the datasets, and the hand model that the networks must have been trained with.
-
-    Returns:
-        The paths of the dataset, and the facts in the header of the last network.
-
-    Raises:
-        MissingResource: no dataset has the networks.
-        BadInput: the networks were trained with another hand model.
+    Raises MissingResource if none has them, BadInput if they were trained with another hand model than the project's.
     """
     check_dataset(model, project)
     runs = [StagePaths(project.profile, name) for name in ((model,) if model else dict.fromkeys(project.datasets))]

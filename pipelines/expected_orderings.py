@@ -144,8 +144,7 @@ def _reason(methods: Mapping[str, Mapping[str, Any]], family: str, metric: str) 
 def taken_for_reverse(evaluator: Mapping[str, Any]) -> float | None:
     """The fraction of motions of a reversible verb that a classifier takes for the reverse; None without such motions.
 
-    Args:
-        evaluator: ``labels`` and ``confusion`` (label, predicted label) of a metrics file.
+    ``evaluator`` has the ``labels`` and ``confusion`` (label, predicted label) of a metrics file.
     """
     labels, table = evaluator.get("labels", []), evaluator.get("confusion", [])
     both = [*REVERSES, *(pair[::-1] for pair in REVERSES)]

@@ -72,9 +72,7 @@ class GenerationRequest:
 def generate_files(request: GenerationRequest, out: Path, store: Path | None = None) -> WrittenFiles:
     """Generate motions; write arrays, an animated GLB and a page with a player into ``out``, and clips to ``store``.
 
-    Raises:
-        MissingResource: models or files are missing.
-        BadInput: the sentence, the object or an option is not usable.
+    Raises MissingResource for missing models or files, BadInput for an unusable sentence, object or option.
     """
     check_new_store(store)
     read_sentence(request.text)  # refuses other text before anything is loaded
@@ -89,7 +87,13 @@ def generate_files(request: GenerationRequest, out: Path, store: Path | None = N
     notes += [*wording.notes, *([reason] if reason else []), *_preset_notes(models.checkpoints, _networks(request))]
     make_repeatable(threads=1)  # one motion is too small to gain from two threads
     hands = models.hands
-    model = user.model if user else _stored_object(str(request.object), models)
+    if user:
+        model = user.model
+    elif models.clips:
+        model = stored_object(str(request.object), models.clips, hands)
+    else:
+        remedy = "correct the path; a dataset's objects are available only in a project"
+        raise BadInput("--object", "a mesh file (.obj, .ply, .stl, .glb)", str(request.object), remedy)
     notes += _missing_hinge_notes(verb, request.object, model)
     generator = _generator(models, replace(models.sampling, **request.sampling))
     generator = replace(generator, model=generator.model.with_sampler(**request.sampler))
@@ -161,18 +165,15 @@ def _slide_notes(model: ObjectModel) -> list[str]:
 
 def _wording(request: GenerationRequest) -> Wording:
     """The sentence in words of the training vocabulary. Raises BadInput for unknown words."""
-    if request.models:
-        vocabulary, encoder = _vocabulary(request.models.checkpoints), request.models.encoder
-        return understood_words(request.text, vocabulary, lambda: encoder, _names(request), request.force)
-    vocabulary = reduce(add, (_vocabulary(paths.checkpoints) for paths in trained_runs(request)))
-    return understood_words(
-        request.text, vocabulary, lambda: _profile_settings(request.profile)[0], _names(request), request.force
-    )
+    models = request.models
 
+    def encoder() -> TextEncoder:
+        return models.encoder if models else _profile_settings(request.profile)[0]
 
-def _names(request: GenerationRequest) -> tuple[str]:
-    """The object's name, whose words a sentence may contain although they are not English."""
-    return (request.object.stem if isinstance(request.object, Path) else request.object,)
+    folders = [models.checkpoints] if models else [paths.checkpoints for paths in trained_runs(request)]
+    # A sentence may contain the words of the object's name although they are not English.
+    name = request.object.stem if isinstance(request.object, Path) else request.object
+    return understood_words(request.text, reduce(add, map(_vocabulary, folders)), encoder, (name,), request.force)
 
 
 def _further_verb_notes(text: str, verb: str | None, vocabulary: Vocabulary) -> list[str]:
@@ -188,10 +189,8 @@ def _project_models(request: GenerationRequest, verb: str | None, noun: str | No
     """The models of the project that fit the sentence best, and the reason in words."""
     paths, reason = chosen_model(request, verb, noun)
     encoder, points, sampling = _profile_settings(paths.profile)
-    hands = load_hands(paths.profile)
-    clips = _clips_with(request, paths)
-    models = Models(paths.checkpoints, hands, encoder, clips=clips, sampling=sampling, points=points)
-    return models, reason
+    hands, clips = load_hands(paths.profile), _clips_with(request, paths)
+    return Models(paths.checkpoints, hands, encoder, clips, sampling, points), reason
 
 
 def _profile_settings(profile: str) -> tuple[TextEncoder, int, SamplingConfig]:
@@ -223,22 +222,15 @@ def _with_object_name(request: GenerationRequest) -> tuple[GenerationRequest, li
     return replace(request, object=name), note
 
 
-def _stored_object(name: str, models: Models) -> ObjectModel:
-    if models.clips is not None:
-        return stored_object(name, models.clips, models.hands)
-    expected = "a mesh file (.obj, .ply, .stl, .glb)"
-    raise BadInput("--object", expected, name, "correct the path; a dataset's objects are available only in a project")
-
-
 def trained_runs(request: GenerationRequest) -> list[StagePaths]:
     """The requested datasets that have models. Raises MissingResource if none has."""
     names = (request.model,) if request.model else request.datasets
-    runs = [StagePaths(request.profile, name) for name in names]
     networks = _networks(request)
+    runs = (StagePaths(request.profile, name) for name in names)
     reasons = {paths: why_not_trained(paths, networks) for paths in runs}
-    trained = [paths for paths in runs if not reasons[paths]]
+    trained = [paths for paths, reason in reasons.items() if not reason]
     if not trained:
-        reason = "; ".join(f"{paths}: {reasons[paths]}" for paths in runs)
+        reason = "; ".join(f"{paths}: {reason}" for paths, reason in reasons.items())
         others = [name for name in request.datasets if not why_not_trained(StagePaths(request.profile, name), networks)]
         alternative = f"; these datasets have models: {', '.join(others)}" if others else ""
         raise MissingResource(f"no models that can generate: {reason}{alternative}")
@@ -257,8 +249,7 @@ def chosen_model(request: GenerationRequest, verb: str | None, noun: str | None)
     vocabularies = {paths: _vocabulary(paths.checkpoints) for paths in trained}
 
     def rank_key(paths: StagePaths) -> tuple[bool, bool, int, int]:
-        words = vocabularies[paths]
-        has_object = _has_object(paths, request.object)
+        words, has_object = vocabularies[paths], _has_object(paths, request.object)
         return verb in words.verbs, has_object, words.knows(verb, noun), words.verbs[verb or ""]
 
     best = max(trained, key=rank_key)

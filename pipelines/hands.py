@@ -75,9 +75,9 @@ class ObjectMotion(NamedTuple):
 
     track: ObjectTrack
     wish: HandSamplingOptions
-    steps: tuple[PathStep, ...]  # of a path from keyframes
     source: str  # in words
     notes: list[str]
+    steps: tuple[PathStep, ...] = ()  # of a path from keyframes
     up: np.ndarray | Unmeasured = UNKNOWN_UP  # (3,) direction of the object that is up when it stands, object frame
     verb: str | None = None  # of a stored clip
 
@@ -88,10 +88,7 @@ def hands_files(
     """Generate hands; write arrays, an animated GLB per sample and a page with a player into ``out``.
 
     With ``store``, the motions also become a store of clips; those for a stored clip are named <clip>~<sample>.
-
-    Raises:
-        MissingResource: networks or files are missing.
-        BadInput: the object, its motion or an option is not usable.
+    Raises MissingResource for missing networks or files, BadInput for an unusable object, motion or option.
     """
     make_repeatable(threads=1)
     check_new_store(store)
@@ -124,13 +121,8 @@ def object_motion(options: HandsOptions, project: ProjectData) -> ObjectMotion:
     if len(sources) != 1:
         got = " and ".join(f"--{name}" for name in sources) or "none"
         raise BadInput("object's motion", "one of --keyframes, --clip or --motion", got, "give one of them")
-    wish = HandSamplingOptions(options.seed, options.samples, options.hand)
-    if options.clip:
-        motion = _clip_motion(options, project, wish)
-    elif options.motion:
-        motion = _generated_motion(options, project, wish)
-    else:
-        motion = _keyframed_motion(options, project, wish)
+    select = {"keyframes": _keyframed_motion, "clip": _clip_motion, "motion": _generated_motion}[sources[0]]
+    motion = select(options, project, HandSamplingOptions(options.seed, options.samples, options.hand))
     if options.length_s is not None:
         motion = _retimed(motion, options.length_s)
     if motion.track.n_frames > MAX_FRAMES:
@@ -188,29 +180,23 @@ def _object(options: HandsOptions, project: ProjectData) -> _MovableObject:
         if user.model.is_articulated and limits is None:
             notes.append("the range of the joint is not known; --hinge-range 0:110 has it checked")
         return _MovableObject(user.model, limits, None, notes)
-    stores = _converted((options.model,) if options.model else project.datasets, project)
+    names = (options.model,) if options.model else project.datasets
+    folders = [StagePaths(project.profile, name).clips for name in names]
+    converted = [folder for folder in folders if not empty_reason(folder) and (folder / "meta").is_dir()]
+    stores = [open_store(folder, project.hands) for folder in converted]
     for store in stores:
         if options.object in list(store.objects["object"]):
-            return _recorded_object(
-                store, options.object, hinge_range(options.hinge_range, store.object_model(options.object))
-            )
+            limits = hinge_range(options.hinge_range, store.object_model(options.object))
+            return _recorded_object(store, options.object, limits)
     names = sorted({name for store in stores for name in store.objects["object"]})
     expected = "a mesh file (.obj, .ply, .stl, .glb)" + (f" or one of: {', '.join(names)}" if names else "")
     remedy = nearest_name(options.object, names) or ("correct the name or path" if names else "correct the path")
     raise BadInput("object", expected, options.object, remedy)
 
 
-def _converted(names: tuple[str, ...], project: ProjectData) -> list[Store]:
-    """The stores of those datasets that are converted."""
-    folders = [StagePaths(project.profile, name).clips for name in names]
-    converted = [folder for folder in folders if not empty_reason(folder) and (folder / "meta").is_dir()]
-    return [open_store(folder, project.hands) for folder in converted]
-
-
 def _recorded_object(store: Store, name: str, limits_rad: tuple[float, float] | None) -> _MovableObject:
     """An object of a dataset, at rest as in the first frame of its first clip, with the recorded range of its hinge."""
-    objects = zip(store.ids, store.sequences["object"], strict=True)
-    clip_ids = [clip_id for clip_id, object_name in objects if object_name == name]
+    clip_ids = store.sequences.index[store.sequences["object"].to_numpy() == name]
     clips, notes = [store.clip(clip_id) for clip_id in clip_ids[:MAX_CLIPS_FOR_RANGE]], list[str]()
     first = clips[0]
     rest_rotation = upright(first.gravity) @ rotvec_to_rotmat(first.object.rotvec[0].astype(np.float64))
@@ -249,7 +235,7 @@ def _keyframed_motion(options: HandsOptions, project: ProjectData, wish: HandSam
     path = keyframed_path(movable.model, keys, movable.hinge_limits_rad, options.keyframes, movable.rest_rotation)
     source = f"keyframes of {Path(options.keyframes).name}"
     up = np.array([0.0, 0.0, 1.0]) if movable.rest_rotation is None else movable.rest_rotation[2]
-    return ObjectMotion(path.track, wish, steps=path.steps, source=source, notes=movable.notes, up=up)
+    return ObjectMotion(path.track, wish, source, movable.notes, path.steps, up)
 
 
 def _clip_motion(options: HandsOptions, project: ProjectData, wish: HandSamplingOptions) -> ObjectMotion:
@@ -262,7 +248,7 @@ def _clip_motion(options: HandsOptions, project: ProjectData, wish: HandSampling
     notes = [] if clip.gravity is not None else ["up: z, assumed: the gravity of this clip is not known"]
     gravity = wish.gravity if clip.gravity is None else np.asarray(clip.gravity, np.float64)
     wish = replace(wish, words=clip.object_words, gravity=gravity, betas=betas, template_m=template_m)
-    return ObjectMotion(clip.object, wish, steps=(), source=f"clip {options.clip}", notes=notes, verb=clip.verb)
+    return ObjectMotion(clip.object, wish, f"clip {options.clip}", notes, verb=clip.verb)
 
 
 def _generated_motion(options: HandsOptions, project: ProjectData, wish: HandSamplingOptions) -> ObjectMotion:
@@ -274,10 +260,7 @@ def _generated_motion(options: HandsOptions, project: ProjectData, wish: HandSam
     missing = [name for name in GENERATED_ARRAYS if name not in arrays]
     if missing:
         raise BadInput(path, "a motion.npz of `hoidata generate`", f"no {missing[0]}", "give one, or --keyframes")
-    if options.object:
-        model, _, _, notes = _object(options, project)
-    else:
-        model, notes = _mesh_of(arrays, path), []
+    model, *_, notes = _object(options, project) if options.object else (_mesh_of(arrays, path), list[str]())
     hinge_rad = arrays.get("object_hinge_rad")
     if model.is_articulated != (hinge_rad is not None):
         remedy = "give the same object as `hoidata generate` had, with its hinge"
@@ -286,8 +269,7 @@ def _generated_motion(options: HandsOptions, project: ProjectData, wish: HandSam
     _check_track(track, path)
     gravity = arrays.get("gravity", np.zeros(0))
     wish = replace(wish, gravity=np.asarray(gravity, np.float64) if gravity.shape == (3,) else wish.gravity)
-    source = f"generated for {str(arrays.get('text', path.name))!r}"
-    return ObjectMotion(track, wish, steps=(), source=source, notes=notes)
+    return ObjectMotion(track, wish, f"generated for {str(arrays.get('text', path.name))!r}", notes)
 
 
 def _mesh_of(arrays: dict[str, np.ndarray], path: Path) -> ObjectModel:
@@ -300,17 +282,15 @@ def _mesh_of(arrays: dict[str, np.ndarray], path: Path) -> ObjectModel:
     fits = vertices.shape == (len(part), 3) and faces.ndim == 2 and faces.shape[1] == 3 and faces.dtype.kind in "iu"
     if not fits or not len(faces) or not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
         raise BadInput(path, "a mesh", f"{vertices.shape}, {faces.shape}", "generate the motion again")
-    return ObjectModel(
-        "object", vertices_m=vertices.astype(np.float64), faces=faces.astype(np.int64), part=part, hinge=hinge
-    )
+    return ObjectModel("object", vertices.astype(np.float64), faces.astype(np.int64), part, hinge)
 
 
 def _check_track(track: ObjectTrack, path: Path) -> None:
-    count = len(track.translation_m)
-    arrays = [track.rotvec, track.translation_m] + ([] if track.hinge_rad is None else [track.hinge_rad])
-    expected = [(count, 3), (count, 3), (count,)][: len(arrays)]
+    count, arrays = len(track.translation_m), [track.rotvec, track.translation_m]
+    arrays += [] if track.hinge_rad is None else [track.hinge_rad]
     shapes = [array.shape for array in arrays]
-    if shapes != expected or not all(array.dtype.kind == "f" and np.isfinite(array).all() for array in arrays):
+    is_finite = all(array.dtype.kind == "f" and np.isfinite(array).all() for array in arrays)
+    if not is_finite or shapes != [(count, 3), (count, 3), (count,)][: len(arrays)]:
         raise BadInput(path, "finite poses of all frames", f"{shapes}", "generate the motion again")
 
 

@@ -49,10 +49,8 @@ def read_metrics(path: Path) -> Facts:
     content = read_json(path)
     if "figures" not in content:
         return content.check({"empty": str})
-    content.check_present({"motions": int, "held_out_clips": int, "left_out": list})
-    content.check_present(
-        dict.fromkeys(("figures", "intervals", "notes", "evaluators", "diagnostics", "unmeasured"), dict)
-    )
+    objects = dict.fromkeys(("figures", "intervals", "notes", "evaluators", "diagnostics", "unmeasured"), dict)
+    content.check_present({"motions": int, "held_out_clips": int, "left_out": list, **objects})
     content["figures"].check(dict.fromkeys(content["figures"], NUMBER_OR_NONE))
     for name in ("intervals", "evaluators"):
         content.get(name, Facts(path, {})).check(dict.fromkeys(content.get(name, ()), dict))
@@ -79,14 +77,12 @@ def _leading(measured: dict[str, Facts]) -> dict[str, dict[str, float]]:
 
 def _unmeasured(measured: dict[str, Facts]) -> dict[str, dict[str, str]]:
     """The leading metrics without a value, by family, with reasons and counts in words."""
-    by_family = {
-        family: {
-            name: reasons_in_words(content["unmeasured"][name])
-            for name in LEADING
-            if name in content.get("unmeasured", {}) and name not in content.get("figures", {})
+    by_family = {}
+    for family, content in measured.items():
+        reasons, values = content.get("unmeasured", {}), content.get("figures", {})
+        by_family[family] = {
+            name: reasons_in_words(reasons[name]) for name in LEADING if name in reasons and name not in values
         }
-        for family, content in measured.items()
-    }
     return {family: words for family, words in by_family.items() if words}
 
 

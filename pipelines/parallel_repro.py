@@ -16,6 +16,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cache
 from multiprocessing import connection
 from pathlib import Path
 from types import ModuleType
@@ -54,19 +55,16 @@ class Run:
 def reproduce_in_parallel(
     targets: list[str], jobs: int, wrap: Callable[[RunStage], RunStage] | None = None, force: bool = False
 ) -> Run:
-    """Bring the targets up to date with up to ``jobs`` parallel stages; the bytes do not depend on ``jobs``.
+    """Bring the targets (none: all) up to date with up to ``jobs`` parallel stages; the bytes do not depend on it.
 
-    A failed stage stops only the stages that depend on it.
+    A failed stage stops only the stages that depend on it. Raises BadInput if another run is in progress.
 
     Args:
-        targets: stages; empty for all.
         wrap: decorates the function that runs one stage, for instance as a Prefect task.
-
-    Raises:
-        BadInput: another run is in progress in this project.
     """
+    cores = max(1, len(os.sched_getaffinity(0)) // jobs)  # of each stage
     # Exited in reverse order: running stages are stopped before the threads that wait for them.
-    with exclusive(RUN, wait_s=0), ThreadPoolExecutor(jobs) as pool, _Children(max(1, _cores() // jobs)) as children:
+    with exclusive(RUN, wait_s=0), ThreadPoolExecutor(jobs) as pool, _Children(cores) as children:
         forget_broken_lock()
         run_stage = wrap(children.run) if wrap else children.run
         start, run = time.monotonic(), Run()
@@ -116,13 +114,9 @@ class Plan:
 
 
 def stale_stages(targets: list[str], force: bool = False) -> Plan:
-    """The stages that must run for the targets.
+    """The stages that must run for the targets; with ``force``, these count as changed.
 
-    Args:
-        force: count the targets as changed.
-
-    Raises:
-        BadInput: a target does not exist, or another DVC command has locked the project.
+    Raises BadInput if a target does not exist, or another DVC command has locked the project.
     """
     from dvc.exceptions import DvcException
 
@@ -148,11 +142,8 @@ def _ask_dvc(targets: list[str], force: bool) -> Plan:
         if changed:
             _check_writable(Path(repo.cache.local.path))
         stale = set(changed).union(*(networkx.ancestors(needed, stage) for stage in changed))
-        upstream = {
-            stage.addressing: frozenset(other.addressing for other in needed.successors(stage) if other in stale)
-            for stage in stages
-            if stage in stale
-        }
+        needs = {stage: stale.intersection(needed.successors(stage)) for stage in stages if stage in stale}
+        upstream = {stage.addressing: frozenset(other.addressing for other in needs[stage]) for stage in needs}
         return Plan(upstream, frozenset(stage.addressing for stage in changed))
 
 
@@ -228,12 +219,9 @@ def describe_run(run: Run) -> str:
     kinds: dict[str, list[float]] = {}
     for name, seconds in run.seconds.items():
         kinds.setdefault(name.split(":")[-1].split("@")[0], []).append(seconds)
-    by_time = sorted(kinds.items(), key=lambda entry: -sum(entry[1]))
-    by_time.append(("all", list(run.seconds.values())))
-    lines = [
-        f"{kind:16} {len(seconds):4} {'stage' if len(seconds) == 1 else 'stages':6} {sum(seconds):8.1f} s"
-        for kind, seconds in by_time
-    ]
+    by_time = [*sorted(kinds.items(), key=lambda entry: -sum(entry[1])), ("all", list(run.seconds.values()))]
+    counts = [(kind, len(times), "stage" if len(times) == 1 else "stages", sum(times)) for kind, times in by_time]
+    lines = [f"{kind:16} {count:4} {word:6} {seconds:8.1f} s" for kind, count, word, seconds in counts]
     lines[-1] += f", in {run.wall:.1f} s wall time"
     lines += [f"failed: {name}; full output: {log_of(name)}" for name in run.failed]
     return "\n".join(lines)
@@ -267,20 +255,13 @@ def _without_dependents(waiting: Upstream, failed: str) -> dict[str, frozenset[s
 
 def _remaining_seconds(upstream: Upstream, durations: Mapping[str, float]) -> dict[str, float]:
     """Per stage, the seconds of the longest chain that starts with it; 1 per stage without a known duration."""
-    dependents: dict[str, list[str]] = {name: [] for name in upstream}
-    for name, needs in upstream.items():
-        for need in needs:
-            dependents[need].append(name)
-    seconds: dict[str, float] = {}
 
-    def fill(name: str) -> float:
-        if name not in seconds:
-            seconds[name] = durations.get(name, 1.0) + max(map(fill, dependents[name]), default=0.0)
-        return seconds[name]
+    @cache
+    def seconds(name: str) -> float:
+        dependents = (other for other, needs in upstream.items() if name in needs)
+        return durations.get(name, 1.0) + max(map(seconds, dependents), default=0.0)
 
-    for name in upstream:
-        fill(name)
-    return seconds
+    return {name: seconds(name) for name in upstream}
 
 
 def likely_seconds(names: Iterable[str]) -> dict[str, float]:
@@ -300,10 +281,6 @@ def likely_seconds(names: Iterable[str]) -> dict[str, float]:
 def log_of(name: str) -> Path:
     """The log file of a stage."""
     return LOGS / f"{name.replace('/', '-').replace(':', '-')}.log"
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
 
 
 class _Children:
@@ -356,9 +333,8 @@ class _Children:
         """Run one stage and return DVC's exit code; its output goes to the log of the stage."""
         LOGS.mkdir(parents=True, exist_ok=True)
         environment = {"HOIDATA_JOBS": str(self.cores), **self.warm.environment}
-        process = self.context.Process(
-            target=_run_single_stage, args=(Path.cwd(), name, name in self.forced, environment)
-        )
+        arguments = (Path.cwd(), name, name in self.forced, environment)
+        process = self.context.Process(target=_run_single_stage, args=arguments)
         with _without_main():
             if self.ends:
                 return 128 + signal.SIGINT

@@ -37,43 +37,31 @@ def read_file(path: Path) -> dict[str, Any]:
 def load_yaml(text: bytes) -> Any:
     """Parse YAML as DVC does: YAML 1.2, in which ``1e-05`` is a number and ``on`` is text.
 
-    Raises:
-        ValueError: the text is not YAML.
-        RecursionError: the nesting is too deep. The parser in C would crash on such text, so it goes to the one in
-            Python.
+    Raises ValueError if the text is not YAML, RecursionError if the nesting is too deep: the parser in C would crash on
+    such text, so it goes to the one in Python.
     """
     from ruamel.yaml import YAML, YAMLError
 
     deep = text.count(b"[") + text.count(b"{") > MAX_NESTING or re.search(rb"[ ?-]{%d}" % MAX_NESTING, text)
     try:
         return YAML(typ="safe", pure=bool(deep)).load(text)
-    except (
-        YAMLError,
-        LookupError,
-        TypeError,
-        AttributeError,
-    ) as error:  # the last three: a tag that does not fit its value
+    except (YAMLError, LookupError, TypeError, AttributeError) as error:  # the last three: a tag does not fit its value
         raise ValueError(str(error)) from error
 
 
 def chosen_params(values: dict[str, Any]) -> Section:
     """The sections with the chosen profile's overlay: mappings are merged, lists and single values replaced.
 
-    All entries keep their full key in the file for error messages. Raises BadInput for an unknown profile or section,
-    and for keys that a profile cannot override.
+    Raises BadInput, with the full key in the file, for unknown profiles or sections and keys that none can override.
     """
-    sections = {name: value for name, value in values.items() if name != "profiles"}
-    overlays = _mapping(values.get("profiles"), "params.yaml: profiles")
-    check_keys(overlays, PROFILES, "params.yaml: profiles")
+    sections, path = {name: value for name, value in values.items() if name != "profiles"}, f"{KEYS}profiles"
+    overlays = _mapping(values.get("profiles"), path)
+    check_keys(overlays, PROFILES, path)
     for profile, overlay in overlays.items():
-        _check_overlay(
-            _mapping(overlay, f"params.yaml: profiles.{profile}"), sections, f"params.yaml: profiles.{profile}"
-        )
-    chosen = _mapping(overlays.get(str(values.get("profile"))), "params.yaml: profiles")
+        _check_overlay(_mapping(overlay, f"{path}.{profile}"), sections, f"{path}.{profile}")
+    chosen = _mapping(overlays.get(str(values.get("profile"))), path)
     overlay_values = {name: value for name, value in chosen.items() if value is not None}
-    return merge_settings(
-        to_section(sections, KEYS), to_section(overlay_values, f"{KEYS}profiles.{values.get('profile')}.")
-    )
+    return merge_settings(to_section(sections, KEYS), to_section(overlay_values, f"{path}.{values.get('profile')}."))
 
 
 def _check_overlay(overlay: dict[str, Any], sections: dict[str, Any], path: str) -> None:

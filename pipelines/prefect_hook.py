@@ -84,8 +84,11 @@ def wrap_lookup(client: type) -> None:
     async def read_deployment_by_name(self, name: str):
         if "/" in name:
             return await original(self, name)
-        matches = await _deployments_named(self, name)
-        names = [] if matches else await _all_names(self)
+        from prefect.client.schemas.filters import DeploymentFilter, DeploymentFilterName
+
+        by_name = DeploymentFilter(name=DeploymentFilterName(any_=[name]))
+        matches = await self.read_deployments(deployment_filter=by_name)
+        names = [] if matches else [deployment.name for deployment in await self.read_deployments()]
         try:
             return only_one(name, matches, names)
         except ValueError as error:
@@ -96,24 +99,12 @@ def wrap_lookup(client: type) -> None:
     client.read_deployment_by_name = read_deployment_by_name
 
 
-async def _deployments_named(client, name: str) -> list:
-    from prefect.client.schemas.filters import DeploymentFilter, DeploymentFilterName
-
-    return await client.read_deployments(deployment_filter=DeploymentFilter(name=DeploymentFilterName(any_=[name])))
-
-
-async def _all_names(client) -> list[str]:
-    return [deployment.name for deployment in await client.read_deployments()]
-
-
 def only_one(name: str, matches: list, names: list[str]):
     """The only deployment with that name. Raises ValueError, with similar ``names``, if there are none or several."""
     if len(matches) == 1:
         return matches[0]
     if not matches:
         similar = ", ".join(get_close_matches(name, names, 3, 0.5))
-        question = f"did you mean {similar}? " if similar else ""
-        raise ValueError(
-            f"no deployment is named {name!r}; {question}`prefect deployment ls` lists them, `hoidata up` creates them"
-        )
+        remedy = f"{f'did you mean {similar}? ' if similar else ''}`prefect deployment ls` lists them"
+        raise ValueError(f"no deployment is named {name!r}; {remedy}, `hoidata up` creates them")
     raise ValueError(f"{len(matches)} flows have a deployment named {name!r}; write FLOW/{name}")

@@ -53,7 +53,7 @@ def _serve(url: str, environment: dict[str, str]) -> int:
     try:
         wait_until_healthy(url, server)
         print(f"{_origin(url)} requires a password: the text in {KEY_FILE}, new at each start", flush=True)
-        flows = _start(_module("pipelines.flows"), environment)
+        flows = _start([sys.executable, "-m", "pipelines.flows"], environment)
         os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)  # wait until server or flows end
         return server.poll() or flows.poll() or 1
     except KeyboardInterrupt:
@@ -151,17 +151,13 @@ def _start_server(url: str, environment: dict[str, str]) -> subprocess.Popen:
     """Start the server; its files, such as the database, are readable by the owner only."""
     address = urlsplit(url)
     options = ("--host", str(address.hostname), "--port", str(address.port))
-    command = _module("prefect", "server", "start", *options, "--analytics-off")
+    command = [sys.executable, "-m", "prefect", "server", "start", *options, "--analytics-off"]
     return _start(command, environment, umask=0o077)
 
 
 def _start(command: list[str], environment: dict[str, str], **options: Any) -> subprocess.Popen:
     """Start a process that ends with this one; otherwise it would send the key to the next server at the address."""
     return subprocess.Popen(command, env=environment, preexec_fn=partial(end_with_parent, os.getpid()), **options)
-
-
-def _module(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", *arguments]
 
 
 def write_key(path: Path = KEY_FILE) -> str:

@@ -24,14 +24,9 @@ MAX_JOBS = 4  # a stage may need up to two gigabytes of memory
 def reproduce(
     targets: list[str], jobs: int = 0, wrap: Callable[[RunStage], RunStage] | None = None, force: bool = False
 ) -> Run:
-    """Check the raw files, then update the targets.
+    """Check the raw files, then update DVC targets (none: all) with ``jobs`` parallel stages (0: ``default_jobs``).
 
-    Args:
-        targets: DVC targets; empty for all.
-        jobs: number of parallel stages; 0: one per core, at most 4.
-
-    Raises:
-        MissingResource: raw or MANO files that a stale stage needs are missing.
+    Raises MissingResource if raw or MANO files that a stale stage needs are missing.
     """
     preflight()
     os.environ.update(stage_environment())
@@ -110,9 +105,8 @@ def require_settings(root: Path) -> None:
                     continue
                 section, _, name = key.rpartition(".")
                 remedy = f"add `{name}: {{}}` under `{section}`, or remove the key from the stage's `params`"
-                raise BadInput(
-                    f"params.yaml: {key}", f"a section for the stage {stage.name}", "none", remedy
-                ) from error
+                expected = f"a section for the stage {stage.name}"
+                raise BadInput(f"params.yaml: {key}", expected, "none", remedy) from error
 
 
 def _is_readable(paths: StagePaths) -> bool:

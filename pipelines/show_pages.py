@@ -24,15 +24,13 @@ CLOSEST = 5
 def write_named_page(name: str, profile: str, out: Path) -> Path:
     """Write the page of the clip or dataset ``name`` of a profile to the folder ``out``; returns its path.
 
-    Raises:
-        BadInput: the name is unknown; the message lists the closest ids.
-        MissingResource: a stage has not run.
+    Raises BadInput, with the closest ids, for an unknown name, and MissingResource if a stage has not run.
     """
     datasets = [str(dataset) for dataset in read_params(Path())["datasets"]]
     if name in datasets:
         paths = StagePaths(profile, name)
         return write_dataset_page(out, paths.data, name, load_hands(profile), dataset_title(name))
-    if (paths := _find_sequence(name, profile)) is not None:
+    if paths := _find_sequence(name, profile, datasets):
         annotated = load_annotated(paths.data, load_hands(profile))
         return write_sequence_page(out / page_name(name), annotated, name.partition("/")[2])
     paths = dataset_of_clip(name, profile, datasets)
@@ -41,14 +39,7 @@ def write_named_page(name: str, profile: str, out: Path) -> Path:
 
 
 def write_page_from(folder: Path, clip_id: str, hands: HandPair, out: Path) -> Path:
-    """Write the page of a clip of ``folder`` to the folder ``out``; without an id, the page of the dataset.
-
-    Args:
-        clip_id: "" for the dataset.
-
-    Raises:
-        BadInput: as in ``write_named_page``.
-    """
+    """Write the page of a clip of ``folder``, or for the id "" of the dataset, to ``out``; see ``write_named_page``."""
     is_store = (folder / "meta").is_dir()
     store = open_store(folder if is_store else folder / "clips", hands)
     if not is_store and _is_sequence(store, clip_id):
@@ -85,13 +76,10 @@ def write_stored_clip(out: Path, store: Store, clip_id: str, hands: HandPair) ->
     return write_page(out / page_name(clip_id), "store_clip.html", **values)
 
 
-def _find_sequence(name: str, profile: str) -> StagePaths | None:
+def _find_sequence(name: str, profile: str, datasets: list[str]) -> StagePaths | None:
     """The dataset with clips of the sequence ``name``, such as ``arctic/s01/box_use_01``; None without."""
-    for paths in (StagePaths(profile, str(key)) for key in read_params(Path())["datasets"]):
-        store = _store(paths)
-        if store is not None and _is_sequence(store, name):
-            return paths
-    return None
+    runs = (StagePaths(profile, dataset) for dataset in datasets)
+    return next((paths for paths in runs if (store := _store(paths)) is not None and _is_sequence(store, name)), None)
 
 
 def _is_sequence(store: Store, name: str) -> bool:

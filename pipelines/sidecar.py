@@ -22,11 +22,7 @@ SCHEMA = "hoidata.run/1"
 
 @contextmanager
 def noted_run(name: str) -> Iterator[None]:
-    """Record the facts of the block as a run of a stage, also if it fails.
-
-    Args:
-        name: of the stage, used if DVC does not set DVC_STAGE.
-    """
+    """Record the facts of the block as a run of the stage of DVC_STAGE, else ``name``, also if it fails."""
     stage, began, start = os.environ.get("DVC_STAGE", name), datetime.now(UTC), time.monotonic()
     ended = "failed"
     try:
@@ -52,15 +48,14 @@ def _cost() -> dict[str, float]:
     """Processor time and peak memory of this process and its children."""
     self_usage, child_usage = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     seconds = self_usage.ru_utime + self_usage.ru_stime + child_usage.ru_utime + child_usage.ru_stime
-    return {
-        "processor_seconds": round(seconds, 2),
-        "peak_mib": max(self_usage.ru_maxrss, child_usage.ru_maxrss) // 1024,
-    }
+    peak_mib = max(self_usage.ru_maxrss, child_usage.ru_maxrss) // 1024
+    return {"processor_seconds": round(seconds, 2), "peak_mib": peak_mib}
 
 
 def _machine() -> dict[str, Any]:
     from hoidata.processor import processor_name
 
+    torch = sys.modules.get("torch")  # not imported here
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     git = subprocess.run(["git", "rev-parse", "--verify", "--quiet", "HEAD"], capture_output=True, text=True)
     return {
@@ -68,15 +63,8 @@ def _machine() -> dict[str, Any]:
         "processor": processor_name(),
         "cores": len(os.sched_getaffinity(0)),
         "memory_gib": round(memory / 2**30, 1),
-        "device": _device(),
+        "device": torch.cuda.get_device_name() if torch and torch.cuda.is_initialized() else "cpu",
         "python": platform.python_version(),
         "system": platform.platform(),
         "commit": git.stdout.strip(),
     }
-
-
-def _device() -> str:
-    """The GPU that was used, else "cpu"; does not import torch."""
-    torch = sys.modules.get("torch")
-    used = torch is not None and torch.cuda.is_initialized()
-    return torch.cuda.get_device_name() if torch is not None and used else "cpu"

@@ -22,7 +22,15 @@ def problems_of(path: Path) -> tuple[list[BadInput], str]:
         return problems, summary if outputs else "sound"
     if reason := empty_reason(path):
         return problems, f"empty, {reason}"
-    return problems + _store_problems(path, bool(problems)), _store_summary(path)
+    from hoidata.store.store import open_store
+    from hoidata.store_check.check import check_store
+
+    try:
+        problems += check_store(path)
+        opened = open_store(path)
+    except BadInput as error:
+        return problems or [error], ""
+    return problems, f"sound, {len(opened)} clips, schema {opened.info['schema_version']}"
 
 
 def _outputs_at(path: Path) -> list[tuple[Path, Locked, str]]:
@@ -48,22 +56,3 @@ def _broken_seal(file: Path) -> BadInput | None:
     except BadInput as error:
         return error
     return BadInput(file, f"the {fault} it was written with, by its own digest", "others", REMEDY) if fault else None
-
-
-def _store_problems(path: Path, is_known_broken: bool) -> list[BadInput]:
-    from hoidata.store_check.check import check_store
-
-    try:
-        return check_store(path)
-    except BadInput as error:
-        return [] if is_known_broken else [error]
-
-
-def _store_summary(path: Path) -> str:
-    from hoidata.store.store import open_store
-
-    try:
-        opened = open_store(path)
-    except BadInput:
-        return ""
-    return f"sound, {len(opened)} clips, schema {opened.info['schema_version']}"

@@ -118,9 +118,7 @@ def _end_with_input() -> None:
 def _answer(connection: socket.socket) -> None:
     """Run a request in the fork and send the exit code; a fork that is killed sends nothing."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    signal.signal(
-        signal.SIGINT, signal.default_int_handler
-    )  # a shell may have started this process with SIGINT ignored
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started us with SIGINT ignored
     end_on_signals()
     os.setpgrp()
     code = 1
