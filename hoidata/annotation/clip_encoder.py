@@ -258,16 +258,11 @@ PROJECTION = "text_projection"
 NAMINGS = "a CLIP text tower by the names of open_clip, OpenAI or transformers"
 # Parts of tensor names: transformers' to open_clip's.
 RENAMED = {
-    "embeddings.token_embedding.": "token_embedding.",
-    "embeddings.position_embedding.weight": "positional_embedding",
-    "final_layer_norm.": "ln_final.",
-    "encoder.layers.": "transformer.resblocks.",
-    ".layer_norm1.": ".ln_1.",
-    ".layer_norm2.": ".ln_2.",
-    ".mlp.fc1.": ".mlp.c_fc.",
-    ".mlp.fc2.": ".mlp.c_proj.",
+    "embeddings.token_embedding.": "token_embedding.", "embeddings.position_embedding.weight": "positional_embedding",
+    "final_layer_norm.": "ln_final.", "encoder.layers.": "transformer.resblocks.", ".layer_norm1.": ".ln_1.",
+    ".layer_norm2.": ".ln_2.", ".mlp.fc1.": ".mlp.c_fc.", ".mlp.fc2.": ".mlp.c_proj.",
     ".self_attn.out_proj.": ".attn.out_proj.",
-}
+}  # fmt: skip
 CONVERT = "write the weights' state_dict() as safetensors (docs/words.md says how)"
 # Prefixes of tensors outside of the text tower, in a whole model of open_clip or OpenAI.
 OTHER_TENSORS = ("visual.", "logit_", "attn_mask", "input_resolution", "context_length", "vocab_size")

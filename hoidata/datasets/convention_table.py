@@ -8,28 +8,10 @@ from hoidata.errors import BadInput
 
 # Allowed keys of ``conventions`` in facts.toml, in the order of the table.
 ROWS = (
-    "unit",
-    "handedness of the world",
-    "meshes",
-    "object rotation",
-    "hand translation",
-    "finger angles",
-    "principal components",
-    "angles beyond pi",
-    "shape",
-    "left shape directions",
-    "left and right",
-    "numbers per hand",
-    "joint order",
-    "finger tips",
-    "parts",
-    "hinge",
-    "camera",
-    "frames",
-    "validity",
-    "labels",
-    "gravity",
-)
+    "unit", "handedness of the world", "meshes", "object rotation", "hand translation", "finger angles",
+    "principal components", "angles beyond pi", "shape", "left shape directions", "left and right", "numbers per hand",
+    "joint order", "finger tips", "parts", "hinge", "camera", "frames", "validity", "labels", "gravity",
+)  # fmt: skip
 HEAD = """# Conventions of the sources
 
 Meaning of the numbers of each source, from `<dataset>/facts.toml`. Every cell has a test that fails if the adapter

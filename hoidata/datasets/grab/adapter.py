@@ -101,12 +101,9 @@ def object_words(name: str) -> str:
 
 TOP_FOLDERS = ("", "GRAB")
 FRAME = WorldFrame("+z", "stated", "GRAB's motion-capture world, right-handed, z up, metres")
+HAND_NOTE = "MANO: absolute axis-angles, the subject's own rest mesh without betas, translation added to its rest wrist"
 CONVENTION = HandConvention(
-    translation="transl",
-    fingers="absolute",
-    shape="personal mesh",
-    left_shape="unused",
-    note="MANO: absolute axis-angles, the subject's own rest mesh without betas, translation added to its rest wrist",
+    translation="transl", fingers="absolute", shape="personal mesh", left_shape="unused", note=HAND_NOTE
 )
 PARTS = (
     DatasetPart("sequences", ("grab/s*/*.npz", "GRAB/grab/s*/*.npz"), "grab__s1.zip to grab__s10.zip"),

@@ -251,20 +251,14 @@ def _segment(header: list[str], words: list[str], location: str) -> Segment:
     return Segment(path, label, *(numbers[name] for name in _LIST_COLUMNS[3:]))
 
 
+PARAMETERS_NOTE = (
+    "MANO in the camera's frame: absolute axis-angles, betas per frame, translation added to the rest wrist"
+)
 PARAMETERS = HandConvention(
-    translation="transl",
-    fingers="absolute",
-    shape="betas per frame",
-    left_shape="as released",
-    note="MANO in the camera's frame: absolute axis-angles, betas per frame, translation added to the rest wrist",
+    translation="transl", fingers="absolute", shape="betas per frame", left_shape="as released", note=PARAMETERS_NOTE
 )
-FITTED = HandConvention(
-    translation="wrist",
-    fingers="absolute",
-    shape="fitted",
-    left_shape="unused",
-    note="21 joints in the camera's frame: a MANO-layout hand was fitted to them, one shape per sequence",
-)
+FITTED_NOTE = "21 joints in the camera's frame: a MANO-layout hand was fitted to them, one shape per sequence"
+FITTED = HandConvention(translation="wrist", fingers="absolute", shape="fitted", left_shape="unused", note=FITTED_NOTE)
 _PARAMETERS, _KEYPOINTS = 62, 64  # numbers of one hand; left comes first
 
 

@@ -54,12 +54,9 @@ HAND_FOLDERS = (
     "Hand_pose/handpose_{}_hand",
 )  # of an older download and of the current one
 FRAME = WorldFrame(None, "estimated", "the world of the camera's trajectory, right-handed, metres, axes not documented")
+HAND_NOTE = "MANO: absolute axis-angles, one shape per person, translation added to the rest wrist, camera frame"
 CONVENTION = HandConvention(
-    translation="transl",
-    fingers="absolute",
-    shape="betas per sequence",
-    left_shape="as released",
-    note="MANO: absolute axis-angles, one shape per person, translation added to the rest wrist, camera frame",
+    translation="transl", fingers="absolute", shape="betas per sequence", left_shape="as released", note=HAND_NOTE
 )
 # A folder of frame files is recorded as one source, so a pattern for the folder is needed too.
 _HANDS = tuple(

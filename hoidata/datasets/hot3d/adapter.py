@@ -47,21 +47,19 @@ WORLD_FROM = {"Aria": np.eye(3), "Quest3": np.array([[1.0, 0, 0], [0, 0, -1], [0
 LOWER_SHORTEST_FRAMES = "nothing to do, or lower the setting shortest_frames"
 GRAVITY = np.array([0.0, 0.0, -1.0])
 FRAME = WorldFrame("+z", "stated", "the headset's world, metres, z up; Quest 3's, y up, is turned about x")
+PARAMETERS_NOTE = (
+    "MANO: 15 principal components relative to the mean pose, left shape directions corrected, translation added"
+)
 PARAMETERS = HandConvention(
     translation="transl",
     fingers="mean-relative",
     shape="betas per sequence",
     left_shape="corrected",
     components=15,
-    note="MANO: 15 principal components relative to the mean pose, left shape directions corrected, translation added",
+    note=PARAMETERS_NOTE,
 )
-FITTED = HandConvention(
-    translation="wrist",
-    fingers="absolute",
-    shape="fitted",
-    left_shape="unused",
-    note="UmeTrack: a MANO-layout hand was fitted to 20 joints and tips, one shape per recording",
-)
+FITTED_NOTE = "UmeTrack: a MANO-layout hand was fitted to 20 joints and tips, one shape per recording"
+FITTED = HandConvention(translation="wrist", fingers="absolute", shape="fitted", left_shape="unused", note=FITTED_NOTE)
 
 
 class _Hands(NamedTuple):

@@ -29,29 +29,15 @@ from hoidata.geometry.transform import RigidTransform
 
 # Object names of instance.json that differ from plain words.
 NOUNS = {
-    "aria_small": "smart glasses",
-    "birdhouse_toy": "toy birdhouse",
-    "bottle_bbq": "barbecue sauce bottle",
-    "bottle_mustard": "mustard bottle",
-    "bottle_ranch": "ranch dressing bottle",
-    "can_parmesan": "parmesan can",
-    "can_soup": "soup can",
-    "can_tomato_sauce": "tomato sauce can",
-    "carton_milk": "milk carton",
-    "carton_oj": "orange juice carton",
-    "dino_toy": "toy dinosaur",
-    "dumbbell_5lb": "dumbbell",
-    "dvd_remote": "remote control",
-    "food_vegetables": "toy vegetables",
-    "food_waffles": "toy waffles",
-    "holder_black": "black holder",
-    "holder_gray": "gray holder",
-    "mug_patterned": "patterned mug",
-    "mug_white": "white mug",
-    "plate_bamboo": "bamboo plate",
-    "spatula_red": "red spatula",
+    "aria_small": "smart glasses", "birdhouse_toy": "toy birdhouse", "bottle_bbq": "barbecue sauce bottle",
+    "bottle_mustard": "mustard bottle", "bottle_ranch": "ranch dressing bottle", "can_parmesan": "parmesan can",
+    "can_soup": "soup can", "can_tomato_sauce": "tomato sauce can", "carton_milk": "milk carton",
+    "carton_oj": "orange juice carton", "dino_toy": "toy dinosaur", "dumbbell_5lb": "dumbbell",
+    "dvd_remote": "remote control", "food_vegetables": "toy vegetables", "food_waffles": "toy waffles",
+    "holder_black": "black holder", "holder_gray": "gray holder", "mug_patterned": "patterned mug",
+    "mug_white": "white mug", "plate_bamboo": "bamboo plate", "spatula_red": "red spatula",
     "spoon_wooden": "wooden spoon",
-}
+}  # fmt: skip
 
 
 def object_words(name: str) -> str:

@@ -69,12 +69,9 @@ MANO_JOINTS = (
 TIP_JOINTS = (*(f"{finger}_DIP_FE" for finger in FINGERS), "THUMB_IP_FE")
 GRAVITY = np.array([0.0, -1.0, 0.0])
 FRAME = WorldFrame("+y", "stated", "Unity's world seen in a mirror with normal x: right-handed, y up")
+HAND_NOTE = "17-joint skeletons: a MANO-layout hand was fitted to joints and tips, one shape per recording"
 CONVENTION = HandConvention(
-    translation="wrist",
-    fingers="absolute",
-    shape="fitted",
-    left_shape="unused",
-    note="17-joint skeletons: a MANO-layout hand was fitted to joints and tips, one shape per recording",
+    translation="wrist", fingers="absolute", shape="fitted", left_shape="unused", note=HAND_NOTE
 )
 PARTS = (
     DatasetPart("object and hand motion", ("sequences/*/*.bvh.gz",), "the data release"),

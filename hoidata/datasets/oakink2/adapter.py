@@ -46,12 +46,11 @@ OBJECTS = ("object_repair", "object_raw", "object_preview")  # repaired, as scan
 TREE = "object_affordance/object_part_tree.json"
 FRAME = WorldFrame(None, "unknown", "the world of the motion capture, right-handed, metres, axes not documented")
 GRAVITY_NOTE = "OakInk2 does not say which way is up; converters of others take y for up"
+HAND_NOTE = (
+    "MANO: absolute quaternions w x y z, betas per frame, the translation is the wrist (manotorch, center_idx 0)"
+)
 CONVENTION = HandConvention(
-    translation="wrist",
-    fingers="absolute",
-    shape="betas per frame",
-    left_shape="as released",
-    note="MANO: absolute quaternions w x y z, betas per frame, the translation is the wrist (manotorch, center_idx 0)",
+    translation="wrist", fingers="absolute", shape="betas per frame", left_shape="as released", note=HAND_NOTE
 )
 PARTS = (
     DatasetPart("motion of hands and objects", tuple(f"{name}/*.pkl" for name in ANNOTATIONS), "anno_preview"),

@@ -33,12 +33,9 @@ FRAME_KEY = re.compile(r"\D*(\d{1,9})")  # 00012, with an optional prefix
 FRAME = WorldFrame(None, "unknown", "the capture rig's world of the recording day, right-handed, metres")
 SHAPE_NOTE = "no {side}_hand_shape.pkl: its betas are zero, as in TACO's own loader"
 GRAVITY_NOTE = "TACO's world frame differs from day to day and its axes are not documented"
+HAND_NOTE = "MANO: absolute axis-angles, own betas for each side, the translation is the wrist (manopth, center_idx 0)"
 CONVENTION = HandConvention(
-    translation="wrist",
-    fingers="absolute",
-    shape="betas per sequence",
-    left_shape="as released",
-    note="MANO: absolute axis-angles, own betas for each side, the translation is the wrist (manopth, center_idx 0)",
+    translation="wrist", fingers="absolute", shape="betas per sequence", left_shape="as released", note=HAND_NOTE
 )
 PARTS = (
     DatasetPart("hand motion and shapes", (f"{HANDS}/*/*/*.pkl",), "Hand_Poses.zip"),
