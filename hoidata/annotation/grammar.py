@@ -117,14 +117,11 @@ def inflect_verb(base: str) -> VerbForms:
     from lemminflect import getInflection
 
     if " and " in base:
-        first, second = map(inflect_verb, base.split(" and ", 1))
-        names = ("gerund", "past_participle", "third_singular")
-        return VerbForms(base, *(f"{getattr(first, name)} and {getattr(second, name)}" for name in names))
+        first, second = (inflect_verb(verb).forms for verb in base.split(" and ", 1))
+        return VerbForms(*map(" and ".join, zip(first, second, strict=True)))
     head, _, rest = base.partition(" ")
-    listed = [getInflection(head, tag=tag, inflect_oov=False) for tag in ("VBG", "VBN", "VBZ")]
-    forms = [
-        irregular[0] if irregular else regular for irregular, regular in zip(listed, regular_forms(head), strict=True)
-    ]
+    tagged = zip(("VBG", "VBN", "VBZ"), regular_forms(head), strict=True)
+    forms = [(getInflection(head, tag=tag, inflect_oov=False) or [regular])[0] for tag, regular in tagged]
     return _phrase((head, *forms), rest)
 
 
