@@ -30,9 +30,8 @@ def table() -> str:
             raise BadInput(f"{facts.name}/facts.toml: conventions", f"some of {', '.join(ROWS)}", ", ".join(unknown))
     lines = [("convention", *(facts.title for facts in columns)), ("---",) * (len(columns) + 1)]
     lines += [(row, *(facts.conventions.get(row, "-") for facts in columns)) for row in ROWS]
-    return HEAD + "".join(f"| {' | '.join(cells)} |\n" for cells in lines).replace("| --- ", "|---").replace(
-        "--- |", "---|"
-    )
+    text = "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+    return HEAD + text.replace("| --- ", "|---").replace("--- |", "---|")
 
 
 if __name__ == "__main__":

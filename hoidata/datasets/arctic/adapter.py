@@ -425,17 +425,12 @@ def _parts_joined(parts: list[Mesh], part_paths: list[str], whole: Mesh, whole_p
     Raises BadInput if their bounding box differs from that of the whole object's mesh.
     """
     base, moving = parts
-    joined = Mesh(
-        np.concatenate([base.vertices, moving.vertices]),
-        np.concatenate([base.faces, moving.faces + len(base.vertices)]),
-    )
+    faces = np.concatenate([base.faces, moving.faces + len(base.vertices)])
+    joined = Mesh(np.concatenate([base.vertices, moving.vertices]), faces)
     boxes = [np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]) for mesh in (joined, whole)]
     difference_mm = float(np.abs(boxes[0] - boxes[1]).max())
     if difference_mm > PARTS_ALIGNED_MM:
-        raise BadInput(
-            ", ".join(part_paths),
-            f"parts with the bounding box of {whole_path}, within {PARTS_ALIGNED_MM:g} mm",
-            f"a difference of {difference_mm:.3g} mm",
-            "remove both files to use mesh.obj and parts.json, or download them again",
-        )
+        expected = f"parts with the bounding box of {whole_path}, within {PARTS_ALIGNED_MM:g} mm"
+        remedy = "remove both files to use mesh.obj and parts.json, or download them again"
+        raise BadInput(", ".join(part_paths), expected, f"a difference of {difference_mm:.3g} mm", remedy)
     return joined, np.arange(len(joined.vertices)) < len(base.vertices)

@@ -44,9 +44,8 @@ def match_boxes(
         raise BadInput(location, f"boxes of the size of {', '.join(names)}", got, remedy)
     if len(assignments) > 1 and assignments[1][0] < MIN_AMBIGUITY_RATIO * max(assignments[0][0], np.log1p(0.02)):
         got = f"parts of nearly the same size: {assignments[0][0]:.1%} and {assignments[1][0]:.1%} off"
-        raise BadInput(
-            location, "parts that their sizes tell apart", got, "nothing to do: which is which cannot be told"
-        )
+        remedy = "nothing to do: which is which cannot be told"
+        raise BadInput(location, "parts that their sizes tell apart", got, remedy)
     chosen = list(assignments[0][1])
     return chosen, tracked_m[chosen] / meshes_m
 
@@ -58,9 +57,8 @@ def aligned_from_whole(path: str, aligned_m: np.ndarray, whole_m: np.ndarray) ->
     transform = rigid_fit(whole_m[None], aligned_m[None])[0]
     max_error_m = float(np.abs(whole_m @ transform[:3, :3].T + transform[:3, 3] - aligned_m).max())
     if max_error_m > 1e-4 * max(1.0, float(np.ptp(whole_m))):
-        raise BadInput(
-            path, "the same mesh, turned and moved", f"one {max_error_m:.3g} m off", "download the models again"
-        )
+        got = f"one {max_error_m:.3g} m off"
+        raise BadInput(path, "the same mesh, turned and moved", got, "download the models again")
     return transform
 
 
@@ -226,10 +224,14 @@ def _part_pose(location: str, entry: Any) -> PartPose:
     return PartPose(label, centre, extents, Rotation.from_euler("XYZ", angles).as_matrix())  # Rx Ry Rz
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def _numbers(location: str, entry: Any, name: str, keys: tuple[str, ...]) -> np.ndarray:
     values = checks.entry(location, entry, name)
     numbers = [checks.entry(f"{location}.{name}", values, key) for key in keys]
-    if any(isinstance(value, bool) or not isinstance(value, int | float) for value in numbers):
+    if not all(map(_is_number, numbers)):
         raise BadInput(f"{location}.{name}", "numbers", repr(numbers)[:40])
     return checks.table(f"{location}.{name}", [numbers], len(keys))[0]
 
@@ -256,7 +258,7 @@ def action_events(data: bytes, path: str) -> list[Event]:
 
 def _times(location: str, item: Any, names: tuple[str, ...]) -> np.ndarray:
     numbers = [checks.entry(location, item, name) for name in names]
-    if any(isinstance(value, bool) or not isinstance(value, int | float) for value in numbers):
+    if not all(map(_is_number, numbers)):
         raise BadInput(location, "times in seconds", repr(numbers)[:40])
     times = checks.table(location, [numbers], len(names))[0]
     if not 0 <= times[0] <= times[1] <= 2 * CLOCKS_S[1]:
@@ -271,7 +273,7 @@ def _clock_s(path: str, value: Mapping[str, Any], last_s: float) -> float:
     if not stated:
         return CLOCKS_S[0] if last_s <= 1.05 * CLOCKS_S[0] else CLOCKS_S[1]
     length = stated[0]
-    if isinstance(length, bool) or not isinstance(length, int | float) or not 1 <= length <= 100:
+    if not _is_number(length) or not 1 <= length <= 100:
         raise BadInput(f"{path}: duration", "seconds, 1 to 100", repr(length)[:40])
     return min(CLOCKS_S, key=lambda clock: abs(clock - length))
 
@@ -281,10 +283,8 @@ def camera_poses(data: bytes, path: str) -> np.ndarray:
     lines = [line.split() for line in data.decode("utf-8", "replace").splitlines() if line.strip()]
     if not lines or len(lines) % 5:
         raise BadInput(path, "five lines per frame", f"{len(lines)} lines")
-    if any(len(line) != 3 for line in lines[::5]):
-        raise BadInput(
-            path, "three numbers above each matrix", " ".join(next(r for r in lines[::5] if len(r) != 3))[:40]
-        )
+    if wrong := next((line for line in lines[::5] if len(line) != 3), None):
+        raise BadInput(path, "three numbers above each matrix", " ".join(wrong)[:40])
     try:
         rows = [[float(word) for word in line] for number, line in enumerate(lines) if number % 5]
     except ValueError as error:
@@ -322,9 +322,8 @@ def hinge_joint(mobility: bytes, tree: bytes, path: str, tree_path: str) -> Join
         raise BadInput(path, "one base and one part that turns", ", ".join(kinds) or "none", remedy)
     meshes = _meshes_by_id(checks.json_value(tree_path, tree), tree_path)
     axis = checks.entry(path, checks.entry(path, moving[0], "jointData"), "axis")
-    origin, direction = (
-        checks.table(f"{path}: {name}", [checks.entry(path, axis, name)], 3)[0] for name in ("origin", "direction")
-    )
+    names = ("origin", "direction")
+    origin, direction = (checks.table(f"{path}: {name}", [checks.entry(path, axis, name)], 3)[0] for name in names)
     length = float(np.linalg.norm(direction))
     if not 1e-6 < length < 1e6:
         raise BadInput(f"{path}: direction", "a direction", str(direction.tolist()))

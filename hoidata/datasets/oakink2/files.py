@@ -269,9 +269,8 @@ def read_names(data: bytes, path: str) -> dict[str, str]:
 def read_roots(data: bytes, location: str) -> dict[str, str]:
     """Read ``object_part_tree.json``: id of the root node by part id. Raises BadInput."""
     value = checks.json_value(location, data)
-    if not isinstance(value, Mapping) or not all(
-        isinstance(names, list) and all(isinstance(name, str) for name in names) for names in value.values()
-    ):
+    lists = list(value.values()) if isinstance(value, Mapping) else [None]
+    if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists):
         raise BadInput(location, "a dictionary of lists of part ids", repr(value)[:40])
     parent = {child: node for node, children in value.items() for child in children}
     topmost: dict[str, str] = {}
