@@ -154,9 +154,8 @@ def with_sway(
 ) -> ObjectPath:
     """Add a slow sway to a carried object."""
     sway = minimum_jerk(path.shift_m[:, 2:] / _CARRIED_M) * waves(times, _SWAY_HZ, 6, rng)
-    return path._replace(
-        shift_m=path.shift_m + sway_m * sway[:, :3], rotation_rad=path.rotation_rad + np.deg2rad(sway_deg) * sway[:, 3:]
-    )
+    shift_m, rotation_rad = path.shift_m + sway_m * sway[:, :3], np.deg2rad(sway_deg) * sway[:, 3:]
+    return path._replace(shift_m=shift_m, rotation_rad=path.rotation_rad + rotation_rad)
 
 
 def waves(times: np.ndarray, rates_hz: tuple[float, float], width: int, rng: np.random.Generator) -> np.ndarray:

@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hoidata.clips.clip import HandType, Side
+from hoidata.clips.clip import SIDES, HandType
 from hoidata.synthetic.actions import DATASET_IDS
 from hoidata.synthetic.catalogue import ObjectSpec, box_at, hinged, hinged_behind, object_spec, tilted
 from hoidata.synthetic.grasps import Approach, GraspSpec
@@ -72,7 +72,6 @@ class StudyObject:
 
 
 Vector = tuple[float, float, float]
-Reaches = tuple[tuple[Side, Approach], ...]
 
 
 def _one(name: str, direction: Vector, through: Vector | None, width=0.3, blend=(0.0, 0.8), yaw=0.0) -> Region:
@@ -81,11 +80,8 @@ def _one(name: str, direction: Vector, through: Vector | None, width=0.3, blend=
 
 def _two(name: str, left: tuple, right: tuple, yaw=0.0) -> Region:
     """left, right: (direction, target point) of each hand."""
-    approaches: Reaches = (
-        ("left", Approach(left[0], 0.25, left[1], (0, 0.7))),
-        ("right", Approach(right[0], 0.25, right[1], (0, 0.7))),
-    )
-    return Region(name, GraspSpec(approaches), yaw)
+    hands = (Approach(direction, 0.25, target, (0, 0.7)) for direction, target in (left, right))
+    return Region(name, GraspSpec(tuple(zip(SIDES, hands, strict=True))), yaw)
 
 
 def _lid(name: str, direction: Vector) -> Region:
@@ -94,11 +90,8 @@ def _lid(name: str, direction: Vector) -> Region:
 
 
 def _base_and_lid(name: str, base: Vector, lid: Vector) -> Region:
-    approaches: Reaches = (
-        ("left", Approach(base, 0.45, part=0)),
-        ("right", Approach(lid, 0.45, part=1)),
-    )
-    return Region(name, GraspSpec(approaches, ANGLES[0], ANGLES))
+    hands = (Approach(direction, 0.45, part=part) for part, direction in enumerate((base, lid)))
+    return Region(name, GraspSpec(tuple(zip(SIDES, hands, strict=True)), ANGLES[0], ANGLES))
 
 
 # Hinge angles, from closed to open, at which a grasp of the lid must be stable.
@@ -405,6 +398,4 @@ def _numbered(pairs) -> Iterator[StudyEntry]:
     done: Counter[tuple] = Counter()
     for subject, (index, verb, hand, region) in pairs:
         done[subject, index, verb] += 1
-        yield StudyEntry(
-            subject=subject, object_index=index, verb=verb, hand=hand, region=region, number=done[subject, index, verb]
-        )
+        yield StudyEntry(subject, index, verb, hand, region=region, number=done[subject, index, verb])
