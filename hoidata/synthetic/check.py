@@ -67,9 +67,9 @@ def explained_by_verb(verbs: list[str], lengths: list[int]) -> float:
 
 def check_sequences(sequences: list[TruthSequence], jobs: int = 1) -> pd.DataFrame:
     """Return one row per dataset: percentage of lifted frames that pass, extremes in mm, controls, clip lengths."""
-    metrics: dict[str, list[SequenceMetrics]] = {}
+    metrics: dict[str, list[SequenceMetrics]] = {truth.dataset: [] for truth in sequences}
     for _, item in map_in_workers(sequence_metrics, sequences, jobs):
-        metrics.setdefault(item.dataset, []).append(item)
+        metrics[item.dataset].append(item)
     return pd.DataFrame([_dataset_metrics(dataset, items) for dataset, items in metrics.items()])
 
 
