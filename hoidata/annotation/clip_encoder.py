@@ -242,12 +242,7 @@ def _size(weights: Path, state: dict[str, torch.Tensor]) -> dict[str, int]:
         expected = f"a CLIP text tower that gives {DIMENSIONS} numbers"
         got = f"{len(layers)} layers, text_projection {tuple(projection.shape)}"
         raise BadInput(weights, expected, got, "pass matching weights")
-    return {
-        "context_length": CONTEXT_TOKENS,
-        "width": width,
-        "heads": width // HEAD_WIDTH,
-        "layers": len(layers),
-    }
+    return {"context_length": CONTEXT_TOKENS, "width": width, "heads": width // HEAD_WIDTH, "layers": len(layers)}
 
 
 Tensors = dict[str, Tensor]
@@ -258,16 +253,11 @@ PROJECTION = "text_projection"
 NAMINGS = "a CLIP text tower by the names of open_clip, OpenAI or transformers"
 # Parts of tensor names: transformers' to open_clip's.
 RENAMED = {
-    "embeddings.token_embedding.": "token_embedding.",
-    "embeddings.position_embedding.weight": "positional_embedding",
-    "final_layer_norm.": "ln_final.",
-    "encoder.layers.": "transformer.resblocks.",
-    ".layer_norm1.": ".ln_1.",
-    ".layer_norm2.": ".ln_2.",
-    ".mlp.fc1.": ".mlp.c_fc.",
-    ".mlp.fc2.": ".mlp.c_proj.",
+    "embeddings.token_embedding.": "token_embedding.", "embeddings.position_embedding.weight": "positional_embedding",
+    "final_layer_norm.": "ln_final.", "encoder.layers.": "transformer.resblocks.", ".layer_norm1.": ".ln_1.",
+    ".layer_norm2.": ".ln_2.", ".mlp.fc1.": ".mlp.c_fc.", ".mlp.fc2.": ".mlp.c_proj.",
     ".self_attn.out_proj.": ".attn.out_proj.",
-}
+}  # fmt: skip
 CONVERT = "write the weights' state_dict() as safetensors (docs/words.md says how)"
 # Prefixes of tensors outside of the text tower, in a whole model of open_clip or OpenAI.
 OTHER_TENSORS = ("visual.", "logit_", "attn_mask", "input_resolution", "context_length", "vocab_size")
@@ -296,21 +286,16 @@ def _of_transformers(path: Path, names: list[str], load: Callable[[str], Tensor]
         remedy = "take the weights of a CLIPModel or a CLIPTextModelWithProjection"
         raise BadInput(path, f"{projection}, the last layer of the text tower", "a CLIPTextModel without it", remedy)
     parts = tuple(f"{prefix}{part}" for part in ("embeddings.", "encoder.", "final_layer_norm."))
-    theirs = {
-        name.removeprefix(prefix): load(name).float()
-        for name in names
-        if name.startswith(parts) and not name.endswith("position_ids")
-    }
+    weights = [name for name in names if name.startswith(parts) and not name.endswith("position_ids")]
+    theirs = {name.removeprefix(prefix): load(name).float() for name in weights}
     attention = {name for name in theirs if name.rpartition(".")[0].endswith(("q_proj", "k_proj", "v_proj"))}
     converted = {_renamed(name): tensor for name, tensor in theirs.items() if name not in attention}
     for query in sorted(name for name in attention if ".q_proj." in name):
         layer, kind = query.split(".self_attn.q_proj.")
-        three = [theirs.get(query.replace("q_proj", part)) for part in ("q_proj", "k_proj", "v_proj")]
-        if any(tensor is None for tensor in three):
+        three = [query.replace("q_proj", part) for part in ("q_proj", "k_proj", "v_proj")]
+        if not theirs.keys() >= set(three):
             raise BadInput(path, f"{prefix}{layer}.self_attn: q_proj, k_proj and v_proj", "not all", "copy it again")
-        converted[_renamed(f"{layer}.attn.in_proj_{kind}")] = torch.cat(
-            [tensor for tensor in three if tensor is not None]
-        )
+        converted[_renamed(f"{layer}.attn.in_proj_{kind}")] = torch.cat([theirs[name] for name in three])
     return {**converted, PROJECTION: load(projection).float().T.contiguous()}
 
 

@@ -1,9 +1,9 @@
 """Word forms of verbs and objects, from tables and, for other words, from rules.
 
-``grammar.csv`` has one row per word: kind (verb or object), base; gerund, past_participle and third_singular of verbs;
-noun_phrase and number (singular, plural or mass) of objects. For other words: lemminflect inflects the first word of a
-verb; the first sound decides the article; the head noun decides the number. ``mass_nouns.json`` lists mass nouns of
-everyday English.
+``words.json`` lists the verbs and objects of the datasets that follow the rules, and mass nouns of everyday English.
+``grammar.csv`` has one row per irregular word: kind (verb or object), base; gerund, past_participle and third_singular
+of verbs; noun_phrase and number (singular, plural or mass) of objects. For other words: lemminflect inflects the first
+word of a verb; the first sound decides the article; the head noun decides the number.
 
 ``phrases.csv`` has idioms of a verb with an object, with lists divided by semicolons. Kinds of rows:
 
@@ -19,6 +19,7 @@ import csv
 import json
 import logging
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
@@ -116,15 +117,17 @@ def inflect_verb(base: str) -> VerbForms:
     from lemminflect import getInflection
 
     if " and " in base:
-        first, second = map(inflect_verb, base.split(" and ", 1))
-        names = ("gerund", "past_participle", "third_singular")
-        return VerbForms(base, *(f"{getattr(first, name)} and {getattr(second, name)}" for name in names))
+        first, second = (inflect_verb(verb).forms for verb in base.split(" and ", 1))
+        return VerbForms(*map(" and ".join, zip(first, second, strict=True)))
     head, _, rest = base.partition(" ")
-    listed = [getInflection(head, tag=tag, inflect_oov=False) for tag in ("VBG", "VBN", "VBZ")]
-    forms = [
-        irregular[0] if irregular else regular for irregular, regular in zip(listed, regular_forms(head), strict=True)
-    ]
-    return VerbForms(base, *(f"{form} {rest}".rstrip() for form in forms))
+    tagged = zip(("VBG", "VBN", "VBZ"), regular_forms(head), strict=True)
+    forms = [(getInflection(head, tag=tag, inflect_oov=False) or [regular])[0] for tag, regular in tagged]
+    return _phrase((head, *forms), rest)
+
+
+def _phrase(forms: Iterable[str], rest: str) -> VerbForms:
+    """Add further words to the forms of a verb: "put" and "down"."""
+    return VerbForms(*(f"{form} {rest}".rstrip() for form in forms))
 
 
 def regular_forms(verb: str) -> tuple[str, str, str]:
@@ -204,28 +207,35 @@ def _inflected(words: str) -> VerbForms:
     verbs, (head, _, rest) = default_grammar().verbs, words.partition(" ")
     if words in verbs:
         return verbs[words]
-    forms = verbs.get(head) or inflect_verb(head)
-    return VerbForms(*(f"{form} {rest}".rstrip() for form in forms.forms))
+    return _phrase((verbs.get(head) or inflect_verb(head)).forms, rest)
 
 
 @lru_cache(maxsize=1)
 def default_grammar() -> Grammar:
-    """Read the table shipped with the package: verbs and objects of H2O, GRAB and ARCTIC, and common others."""
-    rows = _rows("grammar.csv")
-    forms = ("base", "gerund", "past_participle", "third_singular")
-    verbs = {entry["base"]: VerbForms(*(entry[name] for name in forms)) for entry in rows if entry["kind"] == "verb"}
-    nouns = {
-        entry["base"]: NounPhrase(entry["base"], entry["noun_phrase"], cast(Number, entry["number"]))
-        for entry in rows
-        if entry["kind"] == "object"
-    }
-    return Grammar(verbs, nouns)
+    """Read the words shipped with the package: verbs and objects of H2O, GRAB and ARCTIC, and common others."""
+    listed, rules = _listed_words(), Grammar({}, {})
+    nouns, verbs = {base: rules.noun(base) for base in listed["regular_objects"]}, dict[str, VerbForms]()
+    for base in listed["regular_verbs"]:
+        head, _, rest = base.partition(" ")
+        verbs[base] = _phrase((head, *regular_forms(head)), rest)
+    for entry in _rows("grammar.csv"):
+        base = entry["base"]
+        if entry["kind"] == "verb":
+            verbs[base] = VerbForms(base, entry["gerund"], entry["past_participle"], entry["third_singular"])
+        else:
+            nouns[base] = NounPhrase(base, entry["noun_phrase"], cast(Number, entry["number"]))
+    return Grammar(dict(sorted(verbs.items())), dict(sorted(nouns.items())))
+
+
+@lru_cache(maxsize=1)
+def _listed_words() -> dict[str, list[str]]:
+    return json.loads(_text("words.json"))
 
 
 @lru_cache(maxsize=1)
 def mass_nouns() -> frozenset[str]:
     """Return the nouns without article and with a singular verb: water, bread, luggage."""
-    return frozenset(json.loads(_text("mass_nouns.json")))
+    return frozenset(_listed_words()["mass_nouns"])
 
 
 def _rows(table: str) -> list[dict[str, str]]:

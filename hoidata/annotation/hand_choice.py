@@ -20,11 +20,8 @@ from hoidata.annotation.grammar import default_grammar
 from hoidata.clips import SIDES, HandType, Side
 
 HAND_TYPES: tuple[HandType, ...] = ("left", "right", "both")
-TEMPLATES: dict[HandType, str] = {
-    "left": "A photo of left hand",
-    "right": "A photo of right hand",
-    "both": "A photo of both hands",
-}
+_NAMES: dict[HandType, str] = {"left": "left hand", "right": "right hand", "both": "both hands"}
+TEMPLATES: dict[HandType, str] = {hand: f"A photo of {name}" for hand, name in _NAMES.items()}
 # The phrases by which the encoders distinguish hands best, and the cosine margin below which the result is random.
 PHRASES: dict[HandType, str] = {"left": "with the left hand", "right": "with the right hand", "both": "with both hands"}
 MARGIN = 0.05

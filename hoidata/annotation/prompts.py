@@ -117,12 +117,8 @@ def read_prompt(text: str) -> PromptReading:
 @lru_cache(maxsize=1)
 def _labels() -> dict[tuple[str | None, str | None], str]:
     """Map idioms that equal another verb of the table to the verb they replace: "put on" eyeglasses is "wear"."""
-    verbs = default_phrases().verbs
-    return {
-        (phrase.said.base, noun): verb
-        for (verb, noun), phrase in verbs.items()
-        if phrase.said.base in default_grammar().verbs and phrase.said.base != verb
-    }
+    said = {(phrase.said.base, noun): verb for (verb, noun), phrase in default_phrases().verbs.items()}
+    return {key: verb for key, verb in said.items() if key[0] in default_grammar().verbs and key[0] != verb}
 
 
 def _length(match: _Match) -> int:

@@ -25,14 +25,8 @@ HAND_PHRASES: dict[HandType, str] = {"left": "the left hand", "right": "the righ
 UNLABELLED_VERB = "move"
 REFERENCE_HANDS: dict[HandType, str] = {"left": "left hand", "right": "right hand", "both": "both hands"}
 # Object names of the reference implementation that differ from ours.
-JOINED = {
-    "wine glass": "wineglass",
-    "capsule machine": "capsulemachine",
-    "espresso machine": "espressomachine",
-    "waffle iron": "waffleiron",
-    "coffee mug": "coffeemug",
-    "rubber duck": "rubberduck",
-}
+_JOINED = ("wine glass", "capsule machine", "espresso machine", "waffle iron", "coffee mug", "rubber duck")
+JOINED = {words: words.replace(" ", "") for words in _JOINED}
 # Verbs of the reference implementation that differ from the grammar's: GRAB's takepicture.
 ACTIONS = {"take a picture with": VerbForms("take picture", "taking picture", "pictured", "takes picture")}
 SIZED = re.compile(r"(?:large|medium|small) (cube|cylinder|pyramid|sphere|torus)")

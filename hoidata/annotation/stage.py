@@ -33,21 +33,11 @@ VerbSource = Literal["source", "derived"]
 HandSource = Literal["proximity", "annotated"]
 _TEXT = pa.string()
 TEXT_TABLE = pa.schema([("clip_id", _TEXT), ("form", _TEXT), ("sentence", _TEXT), ("text_row", pa.int32())])
-HAND_TYPE_TABLE = pa.schema(
-    [
-        ("clip_id", _TEXT),
-        ("hand_type", _TEXT),
-        ("source", _TEXT),
-        ("min_left_m", pa.float64()),
-        ("min_right_m", pa.float64()),
-        ("labelled_hand", _TEXT),
-        ("agreement", pa.bool_()),
-        ("reason", _TEXT),
-        ("verb", _TEXT),
-        ("verb_source", _TEXT),
-        ("verb_evidence", _TEXT),
-    ]
-)
+HAND_TYPE_TABLE = pa.schema([
+    ("clip_id", _TEXT), ("hand_type", _TEXT), ("source", _TEXT), ("min_left_m", pa.float64()),
+    ("min_right_m", pa.float64()), ("labelled_hand", _TEXT), ("agreement", pa.bool_()), ("reason", _TEXT),
+    ("verb", _TEXT), ("verb_source", _TEXT), ("verb_evidence", _TEXT),
+])  # fmt: skip
 
 
 class _Verb(NamedTuple):
@@ -115,13 +105,8 @@ def annotate_store(
     annotated = _annotate_clips(store, threshold_m, contact.points, excluded or {}, _Writer(settings))
     sentences = list(dict.fromkeys(text for item in annotated for text in item.sentences or ()))
     counts = _counts(annotated, sentences)
-    info = {
-        "encoder": encoder.identity,
-        "threshold_m": threshold_m,
-        "points": contact.points,
-        "forms": settings.forms,
-        "counts": counts,
-    }
+    info = {"encoder": encoder.identity, "threshold_m": threshold_m, "points": contact.points}
+    info |= {"forms": settings.forms, "counts": counts}
     with atomic_folder(out_folder) as partial:
         write_table(partial / "hand_type.parquet", [_hand_row(item) for item in annotated], HAND_TYPE_TABLE)
         write_hand_distances(partial / "hand_distance.npz", [item.evidence for item in annotated])
@@ -178,13 +163,8 @@ def _annotate_clips(
         evidence = find_active_hands(clip, joints, indices[clip.object.model.name], threshold_m)
         hand, verb = writer.hand(clip, evidence), writer.verb(clip, evidence)
         clip = replace(clip, verb=verb.base)
-        if clip_id in excluded:
-            sentences, reason = None, excluded[clip_id]
-        else:
-            sentences, reason = writer.sentences(clip, hand.active, evidence)
-        annotated.append(
-            _Annotated(clip_id, clip.labelled_hand, hand, evidence, sentences=sentences, reason=reason, verb=verb)
-        )
+        said = (None, excluded[clip_id]) if clip_id in excluded else writer.sentences(clip, hand.active, evidence)
+        annotated.append(_Annotated(clip_id, clip.labelled_hand, hand, evidence, *said, verb=verb))
     return annotated
 
 

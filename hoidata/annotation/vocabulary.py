@@ -21,9 +21,7 @@ class Vocabulary:
     @classmethod
     def read(cls, facts: Mapping[str, Any]) -> "Vocabulary":
         """From the facts of a checkpoint."""
-        return cls(
-            {(verb, object_words, hand): count for verb, object_words, hand, count in facts.get("vocabulary", [])}
-        )
+        return cls({(verb, noun, hand): count for verb, noun, hand, count in facts.get("vocabulary", [])})
 
     def __add__(self, other: "Vocabulary") -> "Vocabulary":
         return Vocabulary(Counter(self.counts) + Counter(other.counts))

@@ -36,13 +36,9 @@ LETTERS = "abcdefghijklmnopqrstuvwxyz"
 _WORD = re.compile(r"[^\W\d_]+(?:['’][^\W\d_]+)*")
 # Paraphrases of training verbs, in addition to the synonyms of the word table; the first one that was trained is used.
 PARAPHRASES = {
-    "pick up": ("lift",),
-    "set down": ("place",),
-    "hold": ("grasp", "grab"),
-    "grab": ("grasp",),
-    "grasp": ("grab",),
+    "pick up": ("lift",), "set down": ("place",), "hold": ("grasp", "grab"), "grab": ("grasp",), "grasp": ("grab",),
     "give": ("hand over", "pass"),
-}
+}  # fmt: skip
 PARTICLES = frozenset({"down", "up", "out", "off", "in", "on", "over", "away", "back"})
 NO_OBJECTS = frozenset({"hand", "hands", "left hand", "right hand", "person", "man", "woman"})
 _IS = re.compile(r"\b(?:is|are|was|were|be|been|being)\s+$", re.IGNORECASE)
@@ -232,12 +228,8 @@ def _with_particle(text: str, verbs: Iterable[str]) -> str | None:
         head, *rest = verb.split()
         for start, word in enumerate(words):
             is_noun = start > 0 and words[start - 1] in LEFT_OF_NOUNS
-            after = words[start + 1 : start + 1 + _PARTICLE_WITHIN]
-            if (
-                not is_noun
-                and head in getAllLemmas(word).get("VERB", ())
-                and all(particle in after for particle in rest)
-            ):
+            is_verb = not is_noun and head in getAllLemmas(word).get("VERB", ())
+            if is_verb and set(rest) <= set(words[start + 1 : start + 1 + _PARTICLE_WITHIN]):
                 return verb
     return None
 

@@ -203,18 +203,10 @@ def _mirrored(clips: list[Clip]) -> Finding:
     """A mirrored mesh has negative volume. Below 1 % of the bounding box, as for thin sheets, it is undecided."""
     rule = "object meshes are not turned inside out (mirrored)"
     models = [(clip.clip_id, track.model) for clip in clips for track in (clip.object, *clip.other_objects)]
-    volume_fractions = [
-        (clip_id, model.name, fraction)
-        for clip_id, model in models
-        if (fraction := _volume_fraction(model)) is not None
-    ]
-    if not any(abs(fraction) >= MIN_VOLUME_FRACTION for *_, fraction in volume_fractions):
+    fractions = [(f"{clip_id}: {model.name}", _volume_fraction(model)) for clip_id, model in models]
+    if not any(abs(fraction or 0.0) >= MIN_VOLUME_FRACTION for _, fraction in fractions):
         return undecided(rule, "no mesh encloses 1 % of its bounding box")
-    return finding(
-        rule,
-        [f"{clip_id}: {name}" for clip_id, name, fraction in volume_fractions if fraction < -MIN_VOLUME_FRACTION],
-        "warn",
-    )
+    return finding(rule, [name for name, fraction in fractions if (fraction or 0.0) < -MIN_VOLUME_FRACTION], "warn")
 
 
 def _volume_fraction(model: ObjectModel) -> float | None:
@@ -236,8 +228,6 @@ def _both_hands(clips: list[Clip]) -> list[str]:
             problems.append(f"{clip.clip_id}: no hand is valid in most frames")
     return problems
 
-
-__all__ = ["Finding", "check_adapter"]
 
 TRIES_PER_SEQUENCE = 15
 
@@ -266,10 +256,9 @@ def check_adapter(
     ]
     with opened_files(root) as opened:
         keys = list(adapter.sequences(root))
+    too_early = [f"{path} is opened" for path in sorted(opened)]
     findings.append(finding("sequences are sorted, unique and named as they should be", _keys(adapter, keys)))
-    findings.append(
-        finding("sequences are found by name: no file is opened", [f"{path} is opened" for path in sorted(opened)])
-    )
+    findings.append(finding("sequences are found by name: no file is opened", too_early))
     if not keys:
         return [*findings, finding("at least one sequence gives a clip", ["there is no sequence"])]
     hands = hands_for(adapter.hand_convention, hands)
@@ -380,9 +369,7 @@ def _keys(adapter: Adapter, keys: list[SequenceKey]) -> list[str]:
 
 
 def _is_plain_path(name: str) -> bool:
-    return (
-        bool(name) and not re.search(r"[\\\0\n]", name) and all(part not in ("", ".", "..") for part in name.split("/"))
-    )
+    return not re.search(r"[\\\0\n]", name) and not {"", ".", ".."} & set(name.split("/"))
 
 
 def _load_some(

@@ -47,27 +47,18 @@ def touch_findings(clips: list[Clip], hands: HandPair) -> list[Finding]:
 
     Rules other than the hand length need at least 40 frames with a hand.
     """
-    sampled_clips = [
-        clips[i].take(_spread(clips[i].n_frames, MAX_FRAMES_PER_CLIP)) for i in _spread(len(clips), MAX_CLIPS)
-    ]
+    some_clips = [clips[i] for i in _spread(len(clips), MAX_CLIPS)]
+    sampled_clips = [clip.take(_spread(clip.n_frames, MAX_FRAMES_PER_CLIP)) for clip in some_clips]
     try:
         touches = [_touch(clip, hands) for clip in sampled_clips]
     except Exception as error:  # arrays that check_clip refused, and which another rule reports
         return [skipped("hands touch the object", f"the clips cannot be measured: {error!r}")]
+    wrist_rule = "wrists are within 0.3 m of the object when closest"
+    tip_rule = "a fingertip comes within 2 cm of the object in most clips"
     return [
         _hand_lengths(sampled_clips, hands),
-        _is_near(
-            "wrists are within 0.3 m of the object when closest",
-            [touch.wrist_m for touch in touches],
-            WRIST_M,
-            "unit, frame or translation?",
-        ),
-        _is_near(
-            "a fingertip comes within 2 cm of the object in most clips",
-            [touch.nearest_tip_m for touch in touches],
-            TOUCH_M,
-            "mean pose, frame or parts?",
-        ),
+        _is_near(wrist_rule, [touch.wrist_m for touch in touches], WRIST_M, "unit, frame or translation?"),
+        _is_near(tip_rule, [touch.nearest_tip_m for touch in touches], TOUCH_M, "mean pose, frame or parts?"),
         _bending(sampled_clips, hands),
         _alternative_readings(sampled_clips, touches, hands),
         _rotates_with_hand(sampled_clips, touches),
@@ -179,9 +170,8 @@ def _alternative_readings(clips: list[Clip], touches: list[_Touch], hands: HandP
     if few := _too_few(rule, "with a hand", n_frames):
         return few
     for reading_in_words, reading in READINGS.items():
-        pairs = [
-            _paired(touch, _touch(reading(clip, hands), hands)) for clip, touch in zip(clips, touches, strict=True)
-        ]
+        others = [_touch(reading(clip, hands), hands) for clip in clips]
+        pairs = list(map(_paired, touches, others))
         as_read_m, alternative_m = np.mean(pairs, axis=0)
         agrees = [alternative < MAX_BETTER_RATIO * as_read for as_read, alternative in pairs if as_read or alternative]
         if alternative_m < MAX_BETTER_RATIO * as_read_m and sum(agrees) > 1:  # a single clip may agree by chance
@@ -192,13 +182,10 @@ def _alternative_readings(clips: list[Clip], touches: list[_Touch], hands: HandP
 
 def _paired(touch: _Touch, other: _Touch) -> tuple[float, float]:
     """Mean tip distances of two interpretations, over frames in which a hand touches the object in either."""
-    as_read_m, alternative_m = (
-        np.fmin.reduce([*t.tips_m, np.full(t.tips_m.shape[1], MAX_TIP_DISTANCE_M)]) for t in (touch, other)
-    )
-    at_object = np.minimum(as_read_m, alternative_m) < TOUCH_M
-    return (
-        (float(as_read_m[at_object].mean()), float(alternative_m[at_object].mean())) if at_object.any() else (0.0, 0.0)
-    )
+    tips_m = np.array([np.fmin(np.fmin.reduce(t.tips_m), MAX_TIP_DISTANCE_M) for t in (touch, other)])
+    at_object = tips_m.min(axis=0) < TOUCH_M
+    as_read_m, alternative_m = tips_m[:, at_object].mean(axis=1).tolist() if at_object.any() else (0.0, 0.0)
+    return as_read_m, alternative_m
 
 
 def _rotates_with_hand(clips: list[Clip], touches: list[_Touch]) -> Finding:
@@ -208,10 +195,8 @@ def _rotates_with_hand(clips: list[Clip], touches: list[_Touch]) -> Finding:
     turning = [step[step[:, 2] > MIN_ROTATION_RAD] for step in steps]
     rotating_steps = np.concatenate(turning)
     if len(rotating_steps) < MAX_FRAMES_PER_CLIP // 2 or sum(len(step) > 0 for step in turning) < 2:
-        n_clips = sum(len(step) > 0 for step in turning)
-        return undecided(
-            rule, f"grasped objects rotate in {len(rotating_steps)} steps of {n_clips} clips: load more sequences"
-        )
+        steps_of_clips = f"{len(rotating_steps)} steps of {sum(len(step) > 0 for step in turning)} clips"
+        return undecided(rule, f"grasped objects rotate in {steps_of_clips}: load more sequences")
     as_read_deg, transposed_deg = np.rad2deg(rotating_steps[:, :2].mean(axis=0))
     if transposed_deg >= MAX_BETTER_RATIO * as_read_deg:
         return finding(rule, [])
@@ -235,11 +220,8 @@ def _rotation_steps(clip: Clip, touch: _Touch) -> np.ndarray:
         hand_rotation = hand_rotmat[pairs + 1] @ hand_rotmat[pairs].transpose(0, 2, 1)
         object_rotation = object_rotmat[pairs + 1] @ object_rotmat[pairs].transpose(0, 2, 1)
         transposed_rotation = object_rotmat[pairs + 1].transpose(0, 2, 1) @ object_rotmat[pairs]
-        columns = (
-            object_rotation.transpose(0, 2, 1) @ hand_rotation,
-            transposed_rotation.transpose(0, 2, 1) @ hand_rotation,
-            object_rotation,
-        )
+        readings = (object_rotation, transposed_rotation)
+        columns = (*(rotation.transpose(0, 2, 1) @ hand_rotation for rotation in readings), object_rotation)
         steps.append(np.stack([rotation_angle(column) for column in columns], axis=1))
     return np.concatenate(steps)
 
@@ -249,9 +231,10 @@ def _with_mean(sign: int) -> Reading:
 
 
 def _with_wrist(sign: int) -> Reading:
-    return _each_hand(
-        lambda track, model: {"wrist_m": track.wrist_m + sign * model.wrist_offset_m(track.betas, track.template_m)}
-    )
+    def moved(track: HandTrack, model: HandModel) -> dict[str, np.ndarray]:
+        return {"wrist_m": track.wrist_m + sign * model.wrist_offset_m(track.betas, track.template_m)}
+
+    return _each_hand(moved)
 
 
 def _each_hand(change: Callable[[HandTrack, HandModel], dict[str, np.ndarray]]) -> Reading:

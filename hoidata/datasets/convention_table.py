@@ -8,28 +8,10 @@ from hoidata.errors import BadInput
 
 # Allowed keys of ``conventions`` in facts.toml, in the order of the table.
 ROWS = (
-    "unit",
-    "handedness of the world",
-    "meshes",
-    "object rotation",
-    "hand translation",
-    "finger angles",
-    "principal components",
-    "angles beyond pi",
-    "shape",
-    "left shape directions",
-    "left and right",
-    "numbers per hand",
-    "joint order",
-    "finger tips",
-    "parts",
-    "hinge",
-    "camera",
-    "frames",
-    "validity",
-    "labels",
-    "gravity",
-)
+    "unit", "handedness of the world", "meshes", "object rotation", "hand translation", "finger angles",
+    "principal components", "angles beyond pi", "shape", "left shape directions", "left and right", "numbers per hand",
+    "joint order", "finger tips", "parts", "hinge", "camera", "frames", "validity", "labels", "gravity",
+)  # fmt: skip
 HEAD = """# Conventions of the sources
 
 Meaning of the numbers of each source, from `<dataset>/facts.toml`. Every cell has a test that fails if the adapter
@@ -48,9 +30,8 @@ def table() -> str:
             raise BadInput(f"{facts.name}/facts.toml: conventions", f"some of {', '.join(ROWS)}", ", ".join(unknown))
     lines = [("convention", *(facts.title for facts in columns)), ("---",) * (len(columns) + 1)]
     lines += [(row, *(facts.conventions.get(row, "-") for facts in columns)) for row in ROWS]
-    return HEAD + "".join(f"| {' | '.join(cells)} |\n" for cells in lines).replace("| --- ", "|---").replace(
-        "--- |", "---|"
-    )
+    text = "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+    return HEAD + text.replace("| --- ", "|---").replace("--- |", "---|")
 
 
 if __name__ == "__main__":

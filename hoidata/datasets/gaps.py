@@ -83,6 +83,5 @@ def missing_poses(
     more = f" and {len(spans) - _MAX_LISTED_GAPS} more" if len(spans) > _MAX_LISTED_GAPS else ""
     expected = f"poses of {object_name} without a gap of more than {MAX_BRIDGED_FRAMES} frames at 30 per second"
     got = f"none in source frames {', '.join(spans[:_MAX_LISTED_GAPS])}{more}"
-    return [
-        Quarantined(source_key, where=location, expected=expected, got=got, remedy="nothing to do: clips end there")
-    ]
+    remedy = "nothing to do: clips end there"
+    return [Quarantined(source_key, where=location, expected=expected, got=got, remedy=remedy)]

@@ -10,7 +10,7 @@ A direction is rejected if
 Intervals of different objects, or of one object in different poses, must agree. Otherwise gravity is unknown.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
@@ -18,7 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hoidata.clips.clip import HandTrack, Side
 from hoidata.geometry.intervals import runs
+from hoidata.hands import HandPair, track_joints
 from hoidata.objects.resting import Footing
 
 NO_HAND_M = 0.03  # distance from the object's box, more than the tissue around any joint
@@ -78,9 +80,7 @@ def estimate_gravity(
     joints_m: (frame, joint, 3) joints of both hands in the world, NaN if a hand is not tracked. camera_rotation:
     (frame, 3, 3) world from a head-worn camera with OpenCV axes.
     """
-    rests = [
-        rest for tracked_object in objects for rest in _resting_intervals(tracked_object, joints_m, camera_rotation)
-    ]
+    rests = [rest for item in objects for rest in _resting_intervals(item, joints_m, camera_rotation)]
     unambiguous = [rest for rest in rests if len(rest.downs) == 1]
     if not rests:
         return GravityEstimate(None, "unknown: no object stands still with the hands away")
@@ -89,6 +89,12 @@ def estimate_gravity(
     if not any(rest.lifted for rest in unambiguous):
         return GravityEstimate(None, "unknown: no object is lifted from where it rests")
     return _consensus(unambiguous)
+
+
+def hand_joints_m(tracks: Mapping[Side, HandTrack], hands: HandPair) -> np.ndarray:
+    """(frame, 42, 3) joints of left and right hand in the world, metres; NaN if a hand is not tracked."""
+    joints = [np.where(t.valid[:, None, None], track_joints(t, hands[side]), np.nan) for side, t in tracks.items()]
+    return np.concatenate(joints, axis=1).astype(np.float64)
 
 
 def _consensus(rests: list[_RestingInterval]) -> GravityEstimate:
@@ -135,10 +141,8 @@ def _resting_interval(scene: _Scene, still: np.ndarray) -> _RestingInterval:
     # Restrict the context to frames of the same uninterrupted track.
     first, last = next((a, b) for a, b in runs(scene.tracked_object.frames) if a <= still[0] < b)
     around = np.arange(max(first, still[0] - CONTEXT_FRAMES), min(last, still[-1] + 1 + CONTEXT_FRAMES))
-    near_joints = scene.joints_m[around].reshape(-1, 3)
-    near_joints = near_joints[
-        np.linalg.norm(near_joints - corners.mean(axis=0), axis=1) < REACH_M + np.ptp(corners, axis=0).max() / 2
-    ]
+    joints, reach_m = scene.joints_m[around].reshape(-1, 3), REACH_M + np.ptp(corners, axis=0).max() / 2
+    near_joints = joints[np.linalg.norm(joints - corners.mean(axis=0), axis=1) < reach_m]
     below_head = scene.below_head[still].mean(axis=0)
     possible, lifted = [], False
     for down in scene.tracked_object.footing.downs @ rotation.T:

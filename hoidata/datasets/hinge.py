@@ -37,11 +37,9 @@ class HingeFit(NamedTuple):
     ) -> Quarantined:
         """One reason for the frames whose residuals exceed the limits. frames: (frame,) numbers in the source."""
         rejected_frames = frames[self.exceeds(most_mm, most_deg)]
-        worst_error = (
-            f"up to {1000 * self.residual_m.max():.1f} mm and {np.rad2deg(self.residual_rad.max()):.1f} degrees"
-        )
+        worst = f"{1000 * self.residual_m.max():.1f} mm and {np.rad2deg(self.residual_rad.max()):.1f} degrees"
         expected = f"both parts within {most_mm} mm and {most_deg} degrees of one hinge"
-        got = f"{worst_error} in {len(rejected_frames)} frames, the first {rejected_frames[0]}"
+        got = f"up to {worst} in {len(rejected_frames)} frames, the first {rejected_frames[0]}"
         remedy = "nothing to do, or raise most_off_mm"
         return Quarantined(source_key, where=location, expected=expected, got=got, remedy=remedy)
 
@@ -69,9 +67,8 @@ def fit_hinge(base: np.ndarray, moving: np.ndarray, hinge: Hinge, corners_m: tup
     pose = base
     for _ in range(N_ITERATIONS):
         angle = np.unwrap(_angle_about(hinge.axis, pose[:, :3, :3].transpose(0, 2, 1) @ moving[:, :3, :3]))
-        rest = np.concatenate(
-            [np.broadcast_to(corners_m[0], (len(base), 8, 3)), hinge.turn(angle) @ corners_m[1]], axis=1
-        )
+        of_base = np.broadcast_to(corners_m[0], (len(base), 8, 3))
+        rest = np.concatenate([of_base, hinge.turn(angle) @ corners_m[1]], axis=1)
         pose = rigid_fit(rest, tracked_m)
     distance_m = np.linalg.norm(_transformed(pose, rest) - tracked_m, axis=2)
     relative = pose[:, :3, :3].transpose(0, 2, 1) @ moving[:, :3, :3]
@@ -118,10 +115,8 @@ def hinge_between(
 def hinged_model(name: str, vertices_m: list[np.ndarray], faces: list[np.ndarray], hinge: Hinge) -> ObjectModel:
     """Join two meshes to one object at rest. The base is the first mesh."""
     counts = [len(vertices) for vertices in vertices_m]
-    part = np.repeat(np.array([0, 1], np.uint8), counts)
-    return ObjectModel(
-        name, np.concatenate(vertices_m), np.concatenate([faces[0], faces[1] + counts[0]]), part, hinge=hinge
-    )
+    part, joined = np.repeat(np.array([0, 1], np.uint8), counts), np.concatenate([faces[0], faces[1] + counts[0]])
+    return ObjectModel(name, np.concatenate(vertices_m), joined, part, hinge=hinge)
 
 
 def box_corners(points_m: np.ndarray) -> np.ndarray:
@@ -135,13 +130,7 @@ def _transformed(transforms: np.ndarray, points_m: np.ndarray) -> np.ndarray:
 
 def _angle_about(axis: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """(frame,) angle of the rotation about the unit axis that is closest to each rotation (frame, 3, 3)."""
-    sine_axis = np.stack(
-        [
-            rotation[:, 2, 1] - rotation[:, 1, 2],
-            rotation[:, 0, 2] - rotation[:, 2, 0],
-            rotation[:, 1, 0] - rotation[:, 0, 1],
-        ],
-        axis=1,
-    )
+    doubled_sine = rotation - rotation.transpose(0, 2, 1)
+    sine_axis = np.stack([doubled_sine[:, 2, 1], doubled_sine[:, 0, 2], doubled_sine[:, 1, 0]], axis=1)
     along = np.einsum("i,fij,j->f", axis, rotation, axis)
     return np.arctan2(sine_axis @ axis, np.trace(rotation, axis1=1, axis2=2) - along)

@@ -90,10 +90,8 @@ def _adapter_class(name: str) -> Any:
     if not points:
         raise MissingResource(f"there is no adapter {name!r}; known ones: {', '.join(adapter_names())}")
     if len(points) > 1:
-        packages = ", ".join(sorted(_package(point) for point in points))
-        raise MissingResource(
-            f"{len(points)} packages register the adapter {name!r} ({packages}): uninstall all but one"
-        )
+        packages = f"{len(points)} packages register the adapter {name!r} ({', '.join(sorted(map(_package, points)))})"
+        raise MissingResource(f"{packages}: uninstall all but one")
     try:
         return points[0].load()
     except Exception as error:  # importing foreign code can raise anything

@@ -157,12 +157,10 @@ def object_signals(recording: Clip) -> ObjectSignals:
     before, after = np.maximum(frames - half, 0), np.minimum(frames + half, recording.n_frames - 1)
     turned_rad = rotation_angle(rotation[before].transpose(0, 2, 1) @ rotation[after])
     moved_m = np.linalg.norm(_range_in_window(centre_m), axis=1)
-    down = recording.gravity
+    down, no_frames = recording.gravity, np.zeros(len(frames), bool)
     return ObjectSignals(
         is_carried=(moved_m > CARRIED_M) | (turned_rad > CARRIED_RAD),
-        is_articulated=np.zeros(len(frames), bool)
-        if hinge_rad is None
-        else _range_in_window(hinge_rad) > ARTICULATED_RAD,
+        is_articulated=no_frames if hinge_rad is None else _range_in_window(hinge_rad) > ARTICULATED_RAD,
         speed_m=uniform_filter1d(step_m, WINDOW_FRAMES),
         height_m=None if down is None else -(centre_m - centre_m[0]) @ np.asarray(down, np.float64),
         hinge_rad=hinge_rad,

@@ -101,10 +101,8 @@ def locate_arrays(path: str | Path, member: str) -> dict[str, StoredArray]:
                 raise BadInput(source, "a pickled dict of arrays", f"an array of shape {header.shape}, {header.dtype}")
             small_pickle, locations = _without_long_strings(counted, source)
     content = _dict_of(source, restricted_load(small_pickle, _allowed(locations), path=source))
-    arrays = {
-        str(name): _checked_array(f"{source}.{name}", Path(path), member, value) for name, value in content.items()
-    }
-    return {name: array for name, array in arrays.items() if array is not None}
+    items = ((str(name), _checked_array(f"{source}.{name}", Path(path), member, v)) for name, v in content.items())
+    return {name: array for name, array in items if array is not None}
 
 
 @dataclass(frozen=True)
@@ -263,13 +261,8 @@ def _allowed(locations: list[_Location]) -> dict[tuple[str, str], Any]:
     arrays = {(f"{core}.multiarray", name): _array_record for core in cores for name in ("_reconstruct", "scalar")}
     buffers = {(f"{core}.numeric", "_frombuffer"): _buffer_record for core in cores}
     others = {("numpy", "dtype"): _dtype_record, ("_codecs", "encode"): _encoded}
-    return {
-        **ARRAYS,
-        **others,
-        **arrays,
-        **buffers,
-        **{(_LOCATION, str(index)): location for index, location in enumerate(locations)},
-    }
+    places = {(_LOCATION, str(index)): location for index, location in enumerate(locations)}
+    return {**ARRAYS, **others, **arrays, **buffers, **places}
 
 
 def _dict_of(source: str, record: Any) -> dict[Any, Any]:
@@ -299,9 +292,7 @@ def _checked_array(source: str, path: Path, member: str, record: Any) -> StoredA
     if not fits:
         raise BadInput(source, f"{size} bytes for shape {shape}", f"{length}")
     data = raw if isinstance(raw, _Location) else bytes(raw)
-    return StoredArray(
-        source=source, path=path, member=member, shape=shape, dtype=dtype, data=data, by_columns=bool(by_columns)
-    )
+    return StoredArray(source, path, member, shape, dtype=dtype, data=data, by_columns=bool(by_columns))
 
 
 def _number_type(source: str, record: Any) -> np.dtype:

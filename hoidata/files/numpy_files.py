@@ -103,9 +103,8 @@ def _check_size(path: str | Path, infos: Iterable[zipfile.ZipInfo], min_limit: i
     by_size = max(_FREE_BYTES, _UNPACKED_PER_BYTE * Path(path).stat().st_size)
     limit = max(min_limit, min(_MAX_BYTES, by_size))
     if size > limit:
-        raise BadInput(
-            path, f"at most {limit} bytes when unpacked", str(size), "download it again, or store it uncompressed"
-        )
+        remedy = "download it again, or store it uncompressed"
+        raise BadInput(path, f"at most {limit} bytes when unpacked", str(size), remedy)
 
 
 def _load(path: str | Path, allow_objects: bool) -> np.ndarray:

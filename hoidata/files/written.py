@@ -48,9 +48,8 @@ class Facts(dict[str, Any]):
         """Check entries, and return self. Raises BadInput for a missing entry or another type."""
         for name, expected in shape.items():
             value = self[name]
-            kinds = (
-                (dict,) if isinstance(expected, Mapping) else expected if isinstance(expected, tuple) else (expected,)
-            )
+            kinds = dict if isinstance(expected, Mapping) else expected
+            kinds = kinds if isinstance(kinds, tuple) else (kinds,)
             if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
                 names = ", ".join(kind.__name__ for kind in kinds)
                 raise BadInput(self.path, f"{names} as the entry {self.key + name!r}", repr(value)[:80], REMEDY)
@@ -73,9 +72,8 @@ def check_written(path: str | Path) -> None:
     for digest_of in _digest_sources:
         digest = digest_of(Path(path))
         if digest and digest != md5_file(path):
-            raise BadInput(
-                path, "the bytes its stage wrote, by dvc.lock", "others", f"{REMEDY}; `dvc commit` accepts it"
-            )
+            remedy = f"{REMEDY}; `dvc commit` accepts it"
+            raise BadInput(path, "the bytes its stage wrote, by dvc.lock", "others", remedy)
 
 
 def md5_file(path: str | Path) -> str:

@@ -207,10 +207,8 @@ def _custom(setting: str, dataset: str, values: Mapping[str, Any]) -> Definition
 def _rule_and_promises(source: str, values: Mapping[str, Any]) -> tuple[SplitRule, tuple[Promise, ...]]:
     unknown = sorted(map(str, values.keys() - {*RULE_KEYS, "promises"}))
     if unknown or "by" not in values:
-        got = ", ".join(unknown) or "no `by`"
-        raise BadInput(
-            source, f"keys among: {', '.join(RULE_KEYS)}, promises; by: {', '.join(KINDS)}", got, "correct it"
-        )
+        expected = f"keys among: {', '.join(RULE_KEYS)}, promises; by: {', '.join(KINDS)}"
+        raise BadInput(source, expected, ", ".join(unknown) or "no `by`", "correct it")
     try:
         rule = SplitRule(**{key: value for key, value in values.items() if key != "promises"})
     except TypeError as error:
@@ -233,9 +231,7 @@ def _read(path: Path) -> Definition:
     if not all(origin.values()):
         raise BadInput(path, "the split's version and source", f"{origin}", "state them there")
     rule, promises = _rule_and_promises(str(path), values)
-    return Definition(
-        path.stem, origin["version"], origin["source"], rule, promises=promises, if_chosen=bool(if_chosen)
-    )
+    return Definition(path.stem, rule=rule, promises=promises, if_chosen=bool(if_chosen), **origin)
 
 
 @dataclass(frozen=True)

@@ -13,17 +13,9 @@ from hoidata.files import sha256_bytes
 
 Part = Literal["train", "validation", "test"]
 Kind = Literal[
-    "subject",
-    "object",
-    "sequence",
-    "prefix",
-    "time",
-    "rounds",
-    "drawn",
-    "drawn-per-object",
-    "drawn-object",
+    "subject", "object", "sequence", "prefix", "time", "rounds", "drawn", "drawn-per-object", "drawn-object",
     "composition",
-]
+]  # fmt: skip
 PARTS: tuple[Part, ...] = get_args(Part)
 KINDS: tuple[Kind, ...] = get_args(Kind)
 IN_TIME = ("time", "rounds")

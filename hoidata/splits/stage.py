@@ -154,9 +154,7 @@ def _completeness(store: Store, dataset: str) -> dict[str, Any] | None:
 
 def _write_parts(path: Path, clip_ids: list[str], columns: dict[str, Assignment]) -> None:
     schema = pa.schema([(name, pa.string()) for name in ("clip_id", *columns)])
-    rows = [
-        {"clip_id": clip_id, **{name: parts.get(clip_id) for name, parts in columns.items()}} for clip_id in clip_ids
-    ]
+    rows = [{"clip_id": key, **{name: parts.get(key) for name, parts in columns.items()}} for key in clip_ids]
     write_table(path, rows, schema)
 
 

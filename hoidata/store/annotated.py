@@ -72,9 +72,8 @@ class AnnotatedStore:
         self.text = read_table(annotation / "text.parquet")
         self.hand_types = read_table(annotation / "hand_type.parquet").set_index("clip_id", drop=False)
         chosen = read_table(root / "splits" / "splits.parquet", ["clip_id", "split"])
-        self.splits: dict[str, str | None] = {
-            clip_id: None if pd.isna(subset) else str(subset) for clip_id, subset in chosen.itertuples(index=False)
-        }
+        subsets = [None if pd.isna(subset) else str(subset) for subset in chosen["split"]]
+        self.splits: dict[str, str | None] = dict(zip(chosen["clip_id"], subsets, strict=True))
         self.split_info = read_json(root / "splits" / "info.json", {"chosen": SUBSET_COUNTS, "splits": {}})
         self.split_info["splits"].check(dict.fromkeys(self.split_info["splits"], SUBSET_COUNTS))
         self.annotation_info = read_json(annotation / "info.json", MEASURED)
@@ -242,16 +241,12 @@ class WindowedStore(AnnotatedStore):
 
     def __init__(self, whole: AnnotatedStore, protocol: WindowProtocol, split: str = "test") -> None:
         self.__dict__ |= whole.__dict__  # tables and caches are shared
-        cut = {
-            clip_id: protocol.starts(int(whole.store.sequences.at[clip_id, "n_frames"])) for clip_id in whole.ids(split)
-        }
+        n_frames = whole.store.sequences["n_frames"]
+        cut = {clip_id: protocol.starts(int(n_frames.at[clip_id])) for clip_id in whole.ids(split)}
+        names_of = {clip_id: [f"{clip_id}@{start}" for start in starts] for clip_id, starts in cut.items()}
         self._first = {f"{clip_id}@{start}": start for clip_id, starts in cut.items() for start in starts}
         self._n_frames = protocol.frames
-        clip_of = {
-            name: clip_id
-            for clip_id in whole.store.ids
-            for name in ([f"{clip_id}@{start}" for start in cut[clip_id]] if clip_id in cut else [clip_id])
-        }
+        clip_of = {name: clip_id for clip_id in whole.store.ids for name in names_of.get(clip_id, [clip_id])}
         names, clip_ids = list(clip_of), list(clip_of.values())
         rows = whole.store.sequences.loc[clip_ids].assign(clip_id=names).set_index("clip_id", drop=False)
         first = np.array([self._first.get(name, 0) for name in names])
@@ -262,9 +257,8 @@ class WindowedStore(AnnotatedStore):
             rows.loc[is_window & (rows[f"{side}_betas_count"] > 1), f"{side}_betas_count"] = protocol.frames
         rows.loc[is_window, "n_frames"] = protocol.frames
         rows.loc[is_window, ["camera_row", "body_row", "source_contact_row"]] = -1
-        rows["other_objects"] = [
-            [] if window else others for window, others in zip(is_window, rows["other_objects"], strict=True)
-        ]
+        others = zip(is_window, rows["other_objects"], strict=True)
+        rows["other_objects"] = [[] if window else objects for window, objects in others]
         self.store = replace(whole.store, sequences=rows.rename_axis(None), _rows={})
         self.splits = {name: whole.splits[clip_id] for name, clip_id in clip_of.items()}
         with_text = {name: clip_id for name, clip_id in clip_of.items() if clip_id in whole._sentences}

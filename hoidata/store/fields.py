@@ -51,9 +51,8 @@ class StoreFile:
 
 def _both(field: Field) -> tuple[Field, ...]:
     """Return the field for both hands: ``<side>`` in its name and meaning becomes left and right."""
-    return tuple(
-        replace(field, name=field.name.replace("<side>", s), meaning=field.meaning.replace("<side>", s)) for s in SIDES
-    )
+    texts = [(field.name.replace("<side>", side), field.meaning.replace("<side>", side)) for side in SIDES]
+    return tuple(replace(field, name=name, meaning=meaning) for name, meaning in texts)
 
 
 def _array(
@@ -210,6 +209,7 @@ _TO_SOURCE = "homogeneous matrix, row by row: to the frame and unit of the sourc
 _GRAVITY_NOTE = "how gravity was estimated, or why it is unknown; empty if the source states it"
 _FIT_ERROR = "mean error of hands fitted to keypoints; null for parameters"
 _LENS = "fx, fy, cx, cy, width, height"
+_TEMPLATE = "member of templates.npz, null for the template of MANO"
 
 
 def _rows_of(name: str, array: str, optional: bool = False) -> Field:
@@ -236,9 +236,7 @@ SEQUENCES = StoreFile(
         Field("articulated", "bool", "whether the object has a hinge"),
         *_both(_rows_of("<side>_betas_row", "<side>_betas")),
         *_both(Field("<side>_betas_count", _WHOLE, "rows of <side>_betas: 1, or one per frame")),
-        *_both(
-            Field("<side>_template", _TEXT, "member of templates.npz, null for the template of MANO", required=False)
-        ),
+        *_both(Field("<side>_template", _TEXT, _TEMPLATE, required=False)),
         *_both(Field("<side>_valid_frames", _WHOLE, "how many frames of <side>_valid are True")),
         _rows_of("other_row", "the other_ arrays; object k follows k * n_frames later"),
         _array("gravity", "float64", "xyz:3", "unit vector of gravity; null if unknown", frame="world", required=False),
@@ -339,11 +337,8 @@ INFO = StoreFile(
 TABLES = {"sequences": SEQUENCES, "objects": OBJECTS, "files": FILES, "quarantine": QUARANTINE}
 STORE_FILES = (INFO, *TABLES.values(), FRAMES, BODY, SOURCE_CONTACT, OBJECT_ARRAYS, TEMPLATES, RECORDINGS,
                SOURCE_HANDS)  # fmt: skip
-AXES = {
-    field.name.replace("left_", "<side>_"): list(field.axes)
-    for field in FRAMES.fields
-    if not field.name.startswith("right_")
-}
+_UNPAIRED = [field for field in FRAMES.fields if not field.name.startswith("right_")]
+AXES = {field.name.replace("left_", "<side>_"): list(field.axes) for field in _UNPAIRED}
 
 _ARROW = {
     "string": pa.string(), "bool": pa.bool_(), "int32": pa.int32(), "int64": pa.int64(), "float64": pa.float64(),

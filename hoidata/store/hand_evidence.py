@@ -83,13 +83,10 @@ class HandDistances:
 def write_hand_distances(path: Path, evidence: Sequence[HandEvidence]) -> None:
     """Write the distances of all clips, in the store's order. Frame by frame, float32 metres."""
     counts = [len(item.distance_m[SIDES[0]]) for item in evidence]
-    arrays: dict[str, np.ndarray] = {
-        FIRST_FRAME: np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]).astype(np.int64)
-    }
+    arrays = {FIRST_FRAME: np.cumsum([0, *counts], dtype=np.int64)}
     for side in SIDES:
-        arrays[f"{side}_m"] = np.concatenate(
-            [np.zeros(0, np.float32), *(item.distance_m[side].astype(np.float32) for item in evidence)]
-        )
+        distances = [np.zeros(0, np.float32), *(item.distance_m[side].astype(np.float32) for item in evidence)]
+        arrays[f"{side}_m"] = np.concatenate(distances)
     write_npz(path, arrays)
 
 

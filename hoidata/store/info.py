@@ -112,6 +112,5 @@ def _is_valid(field: Field, value: Any) -> bool:
 def _problem(field: Field, got: str) -> BadInput:
     kind = f"one of {', '.join(field.choices)}" if field.choices else f"a {field.dtype}"
     expected = f"{kind} ({field.meaning})" if field.required else f"{kind} or null ({field.meaning})"
-    return BadInput(
-        f"{_PATH}: {field.name}", expected, got, "pass hoidata.store.info.store_info(...), or convert again"
-    )
+    remedy = "pass hoidata.store.info.store_info(...), or convert again"
+    return BadInput(f"{_PATH}: {field.name}", expected, got, remedy)

@@ -121,9 +121,7 @@ def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
     sequences = sequences.set_index("clip_id", drop=False).rename_axis(None)
     if problems := info_problems(info):
         raise BadInput(folder / problems[0].where, problems[0].expected, problems[0].got, REMEDY)
-    return Store(
-        folder=folder, info=info, sequences=sequences, objects=objects, files=files, quarantine=quarantine, hands=hands
-    )
+    return Store(folder, info, sequences, objects, files=files, quarantine=quarantine, hands=hands)
 
 
 def read_info(folder: str | Path) -> dict[str, Any]:
@@ -217,10 +215,8 @@ class Store:
         if self.hands is None:
             embedded = load_embedded_hands()
             if self.info.get("hand_model", {}).get("digest") != embedded.digest:
-                name = self.info.get("hand_model", {}).get("name", "another hand model")
-                raise MissingResource(
-                    f"{self.folder} was converted with {name}: open_store(folder, hands=...) needs it"
-                )
+                was = f"was converted with {self.info.get('hand_model', {}).get('name', 'another hand model')}"
+                raise MissingResource(f"{self.folder} {was}: open_store(folder, hands=...) needs it")
             self.hands = embedded
         return self.hands
 
@@ -232,9 +228,7 @@ class Store:
                 raise KeyError(f"no object {name!r} in {self.folder}; there are: {', '.join(self.objects['object'])}")
             facts = match.iloc[0]
             arrays = {key: self._file("objects")[f"{name}/{key}"].copy() for key in ("vertices_m", "faces", "part")}
-            hinge = None
-            if facts["articulated"]:
-                hinge = stored_hinge(facts["hinge_axis"], facts["hinge_origin_m"])
+            hinge = stored_hinge(facts["hinge_axis"], facts["hinge_origin_m"]) if facts["articulated"] else None
             self._models[name] = ObjectModel(name, hinge=hinge, **arrays)
         return self._models[name]
 

@@ -281,10 +281,8 @@ class _Writer:
     def _add_contact(self, contact: SourceContact | None) -> dict[str, Any]:
         if contact is None:
             return {"source_contact_row": -1, "source_contact_count": 0}
-        return {
-            "source_contact_row": self.shards.append_all(SOURCE_CONTACT, vars(contact)),
-            "source_contact_count": len(contact.frame),
-        }
+        row = self.shards.append_all(SOURCE_CONTACT, vars(contact))
+        return {"source_contact_row": row, "source_contact_count": len(contact.frame)}
 
     def finish(self, info: dict[str, Any]) -> dict[str, int]:
         self.shards.finish()
@@ -307,9 +305,8 @@ class _Writer:
         }
         recordings = self._write_recordings(names)
         written = {"schema_version": SCHEMA_VERSION, "fps": FPS, "units": UNITS, "axes": AXES, "counts": counts}
-        text = orjson.dumps(
-            orjson.loads(canonical_json(info | written | recordings)), option=orjson.OPT_INDENT_2 | orjson.OPT_SORT_KEYS
-        )
+        facts = orjson.loads(canonical_json(info | written | recordings))
+        text = orjson.dumps(facts, option=orjson.OPT_INDENT_2 | orjson.OPT_SORT_KEYS)
         (self.folder / "meta" / "info.json").write_bytes(text + b"\n")
         return counts
 

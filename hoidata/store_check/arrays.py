@@ -1,6 +1,7 @@
 """Checks the array files of a store against the schema and against the table rows that refer to them."""
 
 from collections.abc import Callable, Iterable, Iterator
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -81,9 +82,8 @@ def read_members(folder: Path, path: str, fields: dict[str, Field]) -> tuple[Arr
         arrays = map_npz(folder / path)
     except BadInput as error:
         return None, [BadInput(error.where.removeprefix(f"{folder}/"), error.expected, error.got, REMEDY)]
-    problems = [
-        BadInput(f"{path}: {name}", "a member", "nothing there", REMEDY) for name in fields if name not in arrays
-    ]
+    absent = [f"{path}: {name}" for name in fields if name not in arrays]
+    problems = [BadInput(member, "a member", "nothing there", REMEDY) for member in absent]
     for name, array in arrays.items():
         if name not in fields:
             problems.append(BadInput(f"{path}: {name}", "only the members of the schema", "a further one", REMEDY))
@@ -122,12 +122,9 @@ def shard_problems(file: StoreFile, shards: dict[int, Arrays], sequences: Column
     """Check that the clips cover each shard exactly, and that their table rows agree with the arrays."""
     for number, arrays in shards.items():
         clips = [clip for clip in _rows(sequences) if clip["shard"] == number]
-        range_problems = [
-            problem
-            for kind in _RANGES
-            if kind.file is file
-            for problem in _range_problems(kind, number, clips, len(arrays[kind.member]))
-        ]
+        kinds = [kind for kind in _RANGES if kind.file is file]
+        by_kind = [list(_range_problems(kind, number, clips, len(arrays[kind.member]))) for kind in kinds]
+        range_problems = list(chain.from_iterable(by_kind))
         yield from range_problems
         if file is FRAMES and not range_problems:
             yield from _frame_problems(clips, arrays)
@@ -161,12 +158,8 @@ def _frame_problems(clips: list[dict[str, Any]], arrays: Arrays) -> Iterator[Bad
         }
         for name, value in from_arrays.items():
             if clip[name] != value:
-                yield BadInput(
-                    f"{SEQUENCES.path}: {name} of {clip['clip_id']}",
-                    f"{value} as in its shard",
-                    f"{clip[name]}",
-                    REMEDY,
-                )
+                column = f"{SEQUENCES.path}: {name} of {clip['clip_id']}"
+                yield BadInput(column, f"{value} as in its shard", f"{clip[name]}", REMEDY)
         if not clip["articulated"] and arrays["object_hinge_rad"][frames].any():
             member = f"{FRAMES.path}: object_hinge_rad of {clip['clip_id']}"
             yield BadInput(member, "0 for a rigid object", "other angles", REMEDY)

@@ -48,9 +48,7 @@ def readme() -> str:
 def _section(file: StoreFile) -> str:
     lines = [f"## `{file.path}`", f"{file.meaning[0].upper()}{file.meaning[1:]}. Order: {file.order}.", ""]
     lines += ["| name | type | unit, frame | meaning |", "|---|---|---|---|"]
-    paired = {
-        field.name.replace("right_", "<side>_", 1): field for field in file.fields if field.name.startswith("right_")
-    }
+    paired = {f.name.replace("right_", "<side>_", 1) for f in file.fields if f.name.startswith("right_")}
     for field in file.fields:
         name = field.name.replace("left_", "<side>_", 1)
         if name in paired:

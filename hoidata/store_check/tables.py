@@ -66,9 +66,8 @@ def _value_problems(file: StoreFile, field: Field, values: list[Any]) -> Iterato
     if field.required:
         yield from _each(column, values, lambda value: value is not None, "a value in every row")
     if field.choices:
-        yield from _each(
-            column, values, lambda v: v is None or v in field.choices, f"one of {', '.join(field.choices)}"
-        )
+        choices = (None, *field.choices)
+        yield from _each(column, values, lambda v: v in choices, f"one of {', '.join(field.choices)}")
     if field.shape:
         yield from _each(column, values, lambda v: v is None or None not in v, "lists without gaps")
     if field.shape and isinstance(field.shape[0], int):

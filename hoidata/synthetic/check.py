@@ -67,15 +67,14 @@ def explained_by_verb(verbs: list[str], lengths: list[int]) -> float:
 
 def check_sequences(sequences: list[TruthSequence], jobs: int = 1) -> pd.DataFrame:
     """Return one row per dataset: percentage of lifted frames that pass, extremes in mm, controls, clip lengths."""
-    metrics: list[SequenceMetrics] = [result for _, result in map_in_workers(sequence_metrics, sequences, jobs)]
-    datasets = dict.fromkeys(truth.dataset for truth in sequences)
-    return pd.DataFrame(
-        [_dataset_metrics(dataset, [item for item in metrics if item.dataset == dataset]) for dataset in datasets]
-    )
+    metrics: dict[str, list[SequenceMetrics]] = {truth.dataset: [] for truth in sequences}
+    for _, item in map_in_workers(sequence_metrics, sequences, jobs):
+        metrics[item.dataset].append(item)
+    return pd.DataFrame([_dataset_metrics(dataset, items) for dataset, items in metrics.items()])
 
 
 def _dataset_metrics(dataset: str, sequences: list[SequenceMetrics]) -> dict[str, str | int | float]:
-    lifted = sum(item.lifted for item in sequences)
+    lifted, lengths = sum(item.lifted for item in sequences), [item.clip_frames for item in sequences]
     return {
         "dataset": dataset,
         "sequences": len(sequences),
@@ -85,9 +84,8 @@ def _dataset_metrics(dataset: str, sequences: list[SequenceMetrics]) -> dict[str
         "pass % without contact": 100 * sum(item.feasible_without_contact for item in sequences) / lifted,
         "largest hand-object distance mm": 1000 * max(item.largest_distance_m for item in sequences),
         "largest penetration mm": 1000 * max(item.largest_penetration_m for item in sequences),
-        "clip length explained by verb %": 100
-        * explained_by_verb([item.verb for item in sequences], [item.clip_frames for item in sequences]),
-        "longest clip": max(item.clip_frames for item in sequences),
+        "clip length explained by verb %": 100 * explained_by_verb([item.verb for item in sequences], lengths),
+        "longest clip": max(lengths),
     }
 
 

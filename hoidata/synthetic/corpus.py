@@ -67,10 +67,8 @@ def make_corpus(
     if size in ("full", "small"):
         generated = run(make_action, tasks_of(dataset, seed, size), "making")
     else:
-        pools = {
-            (task.object_index, task.region): grasps
-            for task, grasps in run(find_grasps, pool_tasks(dataset, seed, size), "grasps")
-        }
+        found = run(find_grasps, pool_tasks(dataset, seed, size), "grasps")
+        pools = {(task.object_index, task.region): grasps for task, grasps in found}
         generated = run(make_clips, clip_tasks(dataset, seed, size, pools), "making")
     return place_in_raw_sequences(dataset, [pair for _, pairs in generated for pair in pairs])
 

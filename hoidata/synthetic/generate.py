@@ -31,10 +31,7 @@ def tasks_of(dataset: str, seed: int, size: Size) -> list[_Task]:
     by_action: dict[int, list[tuple[int, Entry]]] = {}
     for position, entry in enumerate(plan(dataset, size)):
         by_action.setdefault(entry.action, []).append((position, entry))
-    return [
-        _Task(dataset=dataset, seed=seed, size=size, action=action, entries=entries)
-        for action, entries in by_action.items()
-    ]
+    return [_Task(dataset, seed, size, action, entries=entries) for action, entries in by_action.items()]
 
 
 def make_action(task: _Task) -> list[tuple[int, TruthSequence]]:
@@ -48,10 +45,8 @@ def make_action(task: _Task) -> list[tuple[int, TruthSequence]]:
     rng = np.random.default_rng([task.seed, DATASET_IDS[task.dataset], _POOL_STREAM, task.action])
     betas = np.stack([person.betas for person in people])
     pool = search_pool(Scene(spec, model, action.grasp.hinge_rad), action.grasp, pair, betas, rng)
-    by_subject = dict(zip(names, zip(people, pool, strict=True), strict=True))
-    return [
-        (position, _sound_sequence(task, entry, *by_subject[entry.subject], pair)) for position, entry in task.entries
-    ]
+    found = dict(zip(names, zip(people, pool, strict=True), strict=True))
+    return [(position, _sound_sequence(task, entry, *found[entry.subject], pair)) for position, entry in task.entries]
 
 
 def _number(subject: str) -> int:
@@ -84,9 +79,8 @@ def _sound_sequence(
         truth = make_sequence(dataset, action, spec, model, grip, person, key, length, pair, play, rng)
         if measure(truth, pair).is_sound:
             return truth
-    raise HoidataError(
-        f"{dataset}: {action.verb} {action.object_name} by {entry.subject} is not plausible after {_ATTEMPTS} attempts"
-    )
+    what = f"{action.verb} {action.object_name} by {entry.subject}"
+    raise HoidataError(f"{dataset}: {what} is not plausible after {_ATTEMPTS} attempts")
 
 
 _ARCTIC_KINDS = ("use", "grab")

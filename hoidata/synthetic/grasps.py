@@ -266,10 +266,9 @@ class PosedHands:
         layer = kinematics_of(pair[self.side], torch.float64)
         local = rotvec_to_rotmat(self.hand_pose.reshape(-1, 15, 3))
         rotmats = np.concatenate([self.rotmats[:, None], local], axis=1)
+        inputs = (torch.from_numpy(np.ascontiguousarray(a)) for a in (self.wrist_m, rotmats, self.betas))
         with torch.no_grad():
-            vertices, joints = layer(
-                *(torch.from_numpy(np.ascontiguousarray(a)) for a in (self.wrist_m, rotmats, self.betas))
-            )
+            vertices, joints = layer(*inputs)
         return vertices.numpy(), joints.numpy()
 
 
@@ -282,14 +281,7 @@ def posed_hands(candidates: Candidates, betas: np.ndarray) -> PosedHands:
     if candidates.side == "left":
         wrist_m, rotmats = wrist_m * MIRROR, np.diag(MIRROR) @ rotmats @ np.diag(MIRROR)
         pose, opened = (mirror_rotvec_x(one.reshape(-1, 15, 3)).reshape(-1, 45) for one in (pose, opened))
-    return PosedHands(
-        side=candidates.side,
-        wrist_m=wrist_m,
-        rotmats=rotmats,
-        hand_pose=pose,
-        open_pose=opened,
-        betas=betas[rows],
-    )
+    return PosedHands(candidates.side, wrist_m, rotmats, pose, open_pose=opened, betas=betas[rows])
 
 
 def verify(scene: Scene, grasp: GraspSpec, hands: list[PosedHands], pair: HandPair) -> np.ndarray:
@@ -333,9 +325,8 @@ def _verify_at(scene: Scene, grasp: GraspSpec, hands, meshes, pair: HandPair, an
         near.append(surface.nearest(vertices @ object_from_world.T, hinge, REACH_M))
         touch.append(surface.nearest(joints @ object_from_world.T, hinge).distance_m.min(1))
         patches.append(hand_patches(pair[side]))
-    centre = body_motion(
-        scene.model, np.eye(3)[None].repeat(n_candidates, 0), np.zeros((n_candidates, 3)), hinge
-    ).centre_m
+    upright = np.eye(3)[None].repeat(n_candidates, 0)
+    centre = body_motion(scene.model, upright, np.zeros((n_candidates, 3)), hinge).centre_m
     score = np.zeros(n_candidates)
     for index in range(n_candidates):
         depth = max(-one.distance_m[index].min() for one in near)
@@ -465,16 +456,10 @@ def _for_subjects(
     score = verify(scene, grasp, posed, pair)
     clear = np.all([clear_of_table(scene, side) for side in sides], axis=0) & (hand_gap_m(sides) > SMALLEST_HAND_GAP_M)
     score = np.where(clear, score, 0.0).reshape(-1, n_subjects)
+    reaches = [(reach, hand) for (_, reach), hand in zip(grasp.approaches, posed, strict=True)]
     entries = []
     for index, scores in enumerate(score):
-        grips = [
-            tuple(
-                to_grip(scene, reach, hand, index * n_subjects + subject)
-                for (_, reach), hand in zip(grasp.approaches, posed, strict=True)
-            )
-            if scores[subject] > 0
-            else None
-            for subject in range(n_subjects)
-        ]
+        rows = [index * n_subjects + subject if scores[subject] > 0 else None for subject in range(n_subjects)]
+        grips = [None if row is None else tuple(to_grip(scene, *reach, row) for reach in reaches) for row in rows]
         entries.append((scores, grips))
     return entries

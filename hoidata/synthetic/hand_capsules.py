@@ -7,6 +7,7 @@ until they touch, for many candidates in one call.
 """
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -140,14 +141,8 @@ def capsule_points(
     """Return (hand, 21, 4, 3) points on the capsule axes, for hands rotated by (hand, 3, 3) about their wrists."""
     local = finger_rotmats(hands, flexion_rad, swing_rad)
     joints = hands.joints
-    bones = np.stack(
-        [
-            joints[:, _KNUCKLES + 1] - joints[:, _KNUCKLES],
-            joints[:, _KNUCKLES + 2] - joints[:, _KNUCKLES + 1],
-            hands.tips - joints[:, _KNUCKLES + 2],
-        ],
-        axis=2,
-    )
+    at_rest = [*(joints[:, _KNUCKLES + segment] for segment in range(3)), hands.tips]
+    bones = np.stack([end - start for start, end in pairwise(at_rest)], axis=2)
     rotation = np.broadcast_to(np.eye(3), (*bones.shape[:2], 3, 3))
     positions = [joints[:, _KNUCKLES]]
     for segment in range(3):
@@ -161,9 +156,8 @@ def capsule_points(
     ends = np.concatenate([ends, np.stack([end for _, end in palm], axis=1)], axis=1)
     fraction = np.linspace(0, 1, N_SAMPLES)[:, None]
     points = starts[:, :, None] + fraction * (ends - starts)[:, :, None]
-    return (points.reshape(len(points), -1, 3) @ rotmats.transpose(0, 2, 1)).reshape(points.shape) + wrist_m[
-        :, None, None
-    ]
+    rotated = (points.reshape(len(points), -1, 3) @ rotmats.transpose(0, 2, 1)).reshape(points.shape)
+    return rotated + wrist_m[:, None, None]
 
 
 _GRADIENT_STEP_M = 1e-3

@@ -13,6 +13,11 @@ _NEW_SPELLING, _OLD_SPELLING = b"cnumpy._core.", b"cnumpy.core."
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 
 
+def gender(subject: str) -> str:
+    """Return the gender of a subject with a number, such as ``s01``."""
+    return "male" if int(subject[1:]) % 2 else "female"
+
+
 def write_text(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="ascii")

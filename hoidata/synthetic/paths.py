@@ -52,106 +52,66 @@ class ObjectPath(NamedTuple):
 UP = (0.0, 0.0, 0.16)
 _WAVES = 4
 
+
+def still(start: float, stop: float, *pose) -> tuple[Key, Key]:
+    """Two keys with the same pose: shift, rotation and hinge of ``Key``."""
+    return Key(start, *pose), Key(stop, *pose)
+
+
+def there_and_back(*middle: Key, start: float = 0.08, stop: float = 0.96, swing: Swing | None = None) -> Motion:
+    """A motion that rests at its first pose up to the phase ``start`` and from ``stop`` on."""
+    return Motion((Key(0), Key(start), *middle, Key(stop), Key(1)), swing)
+
+
+_REST = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 MOTIONS: dict[str, Motion] = {
-    "grab": Motion((Key(0), Key(0.25), Key(0.9, (0, 0, 0.15)), Key(1, (0, 0, 0.15))), lowered_after=18),
-    "grasp": Motion((Key(0), Key(0.35), Key(0.95, (0, 0, 0.06)), Key(1, (0, 0, 0.06))), lowered_after=14),
-    "lift": Motion(
-        (Key(0), Key(0.15), Key(0.5, (0, 0, 0.21), (22, 0, 0)), Key(0.62, (0, 0, 0.21), (22, 0, 0)), Key(0.95), Key(1))
-    ),
-    "place": Motion(
-        (Key(0, (0, -0.03, 0.13), (20, 0, 0)), Key(0.55, (0.1, 0.08, 0.1), (0, 14, 0)), Key(0.92, (0.1, 0.08, 0)),
-         Key(1, (0.1, 0.08, 0))),
-        lifted_before=18,
-    ),
-    "put in": Motion(
-        (Key(0), Key(0.1), Key(0.4, (0, 0.04, 0.19)), Key(0.65, (-0.12, 0.12, 0.18)), Key(0.95, (-0.12, 0.12, 0)),
-         Key(1, (-0.12, 0.12, 0)))
-    ),
-    "take out": Motion(
-        (Key(0), Key(0.1), Key(0.4, (0, 0, 0.22)), Key(0.65, (0.14, -0.08, 0.15)), Key(0.95, (0.14, -0.08, 0)),
-         Key(1, (0.14, -0.08, 0)))
-    ),
-    "close rigid": Motion(
-        (Key(0), Key(0.1), Key(0.3, (0, -0.04, 0.09)), Key(0.6, (0, -0.04, 0.09), (18, 0, -12)), Key(0.95), Key(1))
-    ),
-    "open rigid": Motion(
-        (Key(0), Key(0.1), Key(0.28, (0, -0.08, 0.13)), Key(0.5, (0, -0.08, 0.13), (0, 0, 28)),
-         Key(0.72, (0, -0.08, 0.13), (0, 0, -28)), Key(0.95), Key(1))
-    ),
-    "spray": Motion(
-        (Key(0), Key(0.1), Key(0.3, (0, 0.06, 0.17)), Key(0.45, (0.05, 0.1, 0.17), (0, 0, -30)),
-         Key(0.7, (-0.08, 0.1, 0.17), (0, 0, 30)), Key(0.95), Key(1))
-    ),
-    "apply": Motion(
-        (Key(0), Key(0.08), Key(0.28, (-0.06, -0.12, 0.15)), Key(0.4, (-0.06, -0.12, 0.15), (40, 0, 0)),
-         Key(0.75, (-0.06, -0.12, 0.15), (40, 0, 0)), Key(0.95), Key(1)),
-        Swing(0.4, 0.75, 3, (0.02, 0, 0)),
-    ),
-    "squeeze": Motion(
-        (Key(0), Key(0.08), Key(0.28, (0, 0, 0.17)), Key(0.42, (0, 0.05, 0.19), (-85, 0, 0)),
-         Key(0.72, (0, 0.05, 0.19), (-85, 0, 0)), Key(0.95), Key(1))
-    ),
-    "pour": Motion(
-        (Key(0), Key(0.08), Key(0.26, UP), Key(0.45, (-0.1, 0.05, 0.2), (0, -75, 0)),
-         Key(0.7, (-0.1, 0.05, 0.2), (0, -75, 0)), Key(0.84, (0, 0, 0.12)), Key(0.97), Key(1))
-    ),
-    "read": Motion(
-        (Key(0), Key(0.07), Key(0.24, (0, -0.14, 0.2), (-30, 0, 0)), Key(0.78, (0, -0.14, 0.2), (-30, 0, 0)),
-         Key(0.96), Key(1))
-    ),
-    "pass": Motion((Key(0), Key(0.12), Key(0.5, (0, 0.14, 0.13)), Key(0.92, (0, 0.25, 0)), Key(1, (0, 0.25, 0)))),
-    "toast": Motion(
-        (Key(0), Key(0.1), Key(0.32, (0, 0.02, 0.2)), Key(0.5, (-0.08, 0.16, 0.26), (0, -14, 0)),
-         Key(0.7, (0, 0.02, 0.18)), Key(0.96), Key(1))
-    ),
-    "shake": Motion(
-        (Key(0), Key(0.08), Key(0.25, (0, -0.03, 0.17), (0, -30, 0)), Key(0.8, (0, -0.03, 0.17), (0, -30, 0)),
-         Key(0.97), Key(1)),
-        Swing(0.25, 0.8, 5, (0, 0, 0.03)),
-    ),
-    "hand over": Motion(
-        (Key(0), Key(0.1), Key(0.35, (0.1, -0.02, 0.14)), Key(0.65, (-0.1, 0.08, 0.15)), Key(0.95, (-0.1, 0.16, 0)),
-         Key(1, (-0.1, 0.16, 0)))
-    ),
-    "eat": Motion(
-        (Key(0), Key(0.08), Key(0.3, (0, -0.2, 0.27)), Key(0.45, (0, -0.12, 0.2)),
-         Key(0.62, (0, -0.2, 0.27), (20, 0, 0)), Key(0.96), Key(1))
-    ),
-    "use": Motion(
-        (Key(0), Key(0.08), Key(0.26, (0, 0.08, 0.14)), Key(0.8, (0, 0.08, 0.14)), Key(0.97), Key(1)),
-        Swing(start=0.26, stop=0.8, cycles=3, shift_m=(0, 0, 0.03), rotation_deg=(0, 22, 0)),
-    ),
-    "drink": Motion(
-        (Key(0), Key(0.08), Key(0.28, (0, -0.13, 0.24)), Key(0.42, (0, -0.2, 0.27), (50, 0, 0)),
-         Key(0.65, (0, -0.2, 0.27), (50, 0, 0)), Key(0.78, (0, -0.13, 0.2)), Key(0.97), Key(1))
-    ),
-    "inspect": Motion(
-        (Key(0), Key(0.07), Key(0.2, (0, -0.12, 0.18)), Key(0.35, (0, -0.12, 0.18), (20, 0, 38)),
-         Key(0.58, (0, -0.12, 0.18), (20, 0, -38)), Key(0.75, (0, -0.12, 0.18), (-10, 20, 0)), Key(0.97), Key(1))
-    ),
-    "sprinkle": Motion(
-        (Key(0), Key(0.08), Key(0.25, (0, 0, 0.18)), Key(0.4, (-0.05, 0.06, 0.2), (-95, 0, 0)),
-         Key(0.76, (-0.05, 0.06, 0.2), (-95, 0, 0)), Key(0.97), Key(1)),
-        Swing(0.4, 0.76, 4, (0, 0, 0.015)),
-    ),
-    "type": Motion(
-        (Key(0), Key(0.07), Key(0.24, (0, -0.14, 0.16), (28, 0, 0)), Key(0.8, (0, -0.14, 0.16), (28, 0, 0)),
-         Key(0.97), Key(1)),
-        Swing(0.24, 0.8, 6, (0, 0, 0.004)),
-    ),
-    "open": Motion(
-        (Key(0, hinge=0.4), Key(0.1, hinge=0.4), Key(0.4, (0, 0, 0.09), (-22, 0, 0), hinge=0.4),
-         Key(0.54, (0, 0, 0.09), (-22, 0, 0), hinge=0.85), Key(0.97, hinge=0.85), Key(1, hinge=0.85))
-    ),
-    "close": Motion(
-        (Key(0, hinge=0.85), Key(0.1, hinge=0.85), Key(0.42, (0, -0.02, 0.07), (-18, 0, 0), hinge=0.85),
-         Key(0.58, (0, -0.02, 0.07), (-18, 0, 0), hinge=0.4), Key(0.97, hinge=0.4), Key(1, hinge=0.4))
-    ),
-    "operate": Motion(
-        (Key(0, hinge=0.4), Key(0.1, hinge=0.4), Key(0.28, (0, -0.03, 0.05), (-14, 0, 0), hinge=0.4),
-         Key(0.38, (0, -0.03, 0.05), (-14, 0, 0), hinge=0.85), Key(0.6, (0, -0.03, 0.05), (-14, 0, 0), hinge=0.85),
-         Key(0.7, (0, -0.03, 0.05), (-14, 0, 0), hinge=0.4), Key(0.97, hinge=0.4), Key(1, hinge=0.4))
-    ),
+    "grab": Motion((Key(0), Key(0.25), *still(0.9, 1, (0, 0, 0.15))), lowered_after=18),
+    "grasp": Motion((Key(0), Key(0.35), *still(0.95, 1, (0, 0, 0.06))), lowered_after=14),
+    "lift": there_and_back(*still(0.5, 0.62, (0, 0, 0.21), (22, 0, 0)), start=0.15, stop=0.95),
+    "place": Motion((Key(0, (0, -0.03, 0.13), (20, 0, 0)), Key(0.55, (0.1, 0.08, 0.1), (0, 14, 0)),
+        *still(0.92, 1, (0.1, 0.08, 0))), lifted_before=18),
+    "put in": Motion((Key(0), Key(0.1), Key(0.4, (0, 0.04, 0.19)), Key(0.65, (-0.12, 0.12, 0.18)),
+        *still(0.95, 1, (-0.12, 0.12, 0)))),
+    "take out": Motion((Key(0), Key(0.1), Key(0.4, (0, 0, 0.22)), Key(0.65, (0.14, -0.08, 0.15)),
+        *still(0.95, 1, (0.14, -0.08, 0)))),
+    "close rigid": there_and_back(Key(0.3, (0, -0.04, 0.09)), Key(0.6, (0, -0.04, 0.09), (18, 0, -12)), start=0.1,
+        stop=0.95),
+    "open rigid": there_and_back(Key(0.28, (0, -0.08, 0.13)), Key(0.5, (0, -0.08, 0.13), (0, 0, 28)),
+        Key(0.72, (0, -0.08, 0.13), (0, 0, -28)), start=0.1, stop=0.95),
+    "spray": there_and_back(Key(0.3, (0, 0.06, 0.17)), Key(0.45, (0.05, 0.1, 0.17), (0, 0, -30)),
+        Key(0.7, (-0.08, 0.1, 0.17), (0, 0, 30)), start=0.1, stop=0.95),
+    "apply": there_and_back(Key(0.28, (-0.06, -0.12, 0.15)), *still(0.4, 0.75, (-0.06, -0.12, 0.15), (40, 0, 0)),
+        stop=0.95, swing=Swing(0.4, 0.75, 3, (0.02, 0, 0))),
+    "squeeze": there_and_back(Key(0.28, (0, 0, 0.17)), *still(0.42, 0.72, (0, 0.05, 0.19), (-85, 0, 0)), stop=0.95),
+    "pour": there_and_back(Key(0.26, UP), *still(0.45, 0.7, (-0.1, 0.05, 0.2), (0, -75, 0)), Key(0.84, (0, 0, 0.12)),
+        stop=0.97),
+    "read": there_and_back(*still(0.24, 0.78, (0, -0.14, 0.2), (-30, 0, 0)), start=0.07),
+    "pass": Motion((Key(0), Key(0.12), Key(0.5, (0, 0.14, 0.13)), *still(0.92, 1, (0, 0.25, 0)))),
+    "toast": there_and_back(Key(0.32, (0, 0.02, 0.2)), Key(0.5, (-0.08, 0.16, 0.26), (0, -14, 0)),
+        Key(0.7, (0, 0.02, 0.18)), start=0.1),
+    "shake": there_and_back(*still(0.25, 0.8, (0, -0.03, 0.17), (0, -30, 0)), stop=0.97,
+        swing=Swing(0.25, 0.8, 5, (0, 0, 0.03))),
+    "hand over": Motion((Key(0), Key(0.1), Key(0.35, (0.1, -0.02, 0.14)), Key(0.65, (-0.1, 0.08, 0.15)),
+        *still(0.95, 1, (-0.1, 0.16, 0)))),
+    "eat": there_and_back(Key(0.3, (0, -0.2, 0.27)), Key(0.45, (0, -0.12, 0.2)),
+        Key(0.62, (0, -0.2, 0.27), (20, 0, 0))),
+    "use": there_and_back(*still(0.26, 0.8, (0, 0.08, 0.14)), stop=0.97,
+        swing=Swing(0.26, 0.8, 3, (0, 0, 0.03), (0, 22, 0))),
+    "drink": there_and_back(Key(0.28, (0, -0.13, 0.24)), *still(0.42, 0.65, (0, -0.2, 0.27), (50, 0, 0)),
+        Key(0.78, (0, -0.13, 0.2)), stop=0.97),
+    "inspect": there_and_back(Key(0.2, (0, -0.12, 0.18)), Key(0.35, (0, -0.12, 0.18), (20, 0, 38)),
+        Key(0.58, (0, -0.12, 0.18), (20, 0, -38)), Key(0.75, (0, -0.12, 0.18), (-10, 20, 0)), start=0.07, stop=0.97),
+    "sprinkle": there_and_back(Key(0.25, (0, 0, 0.18)), *still(0.4, 0.76, (-0.05, 0.06, 0.2), (-95, 0, 0)), stop=0.97,
+        swing=Swing(0.4, 0.76, 4, (0, 0, 0.015))),
+    "type": there_and_back(*still(0.24, 0.8, (0, -0.14, 0.16), (28, 0, 0)), start=0.07, stop=0.97,
+        swing=Swing(0.24, 0.8, 6, (0, 0, 0.004))),
+    "open": Motion((*still(0, 0.1, *_REST, 0.4), Key(0.4, (0, 0, 0.09), (-22, 0, 0), 0.4),
+        Key(0.54, (0, 0, 0.09), (-22, 0, 0), 0.85), *still(0.97, 1, *_REST, 0.85))),
+    "close": Motion((*still(0, 0.1, *_REST, 0.85), Key(0.42, (0, -0.02, 0.07), (-18, 0, 0), 0.85),
+        Key(0.58, (0, -0.02, 0.07), (-18, 0, 0), 0.4), *still(0.97, 1, *_REST, 0.4))),
+    "operate": Motion((*still(0, 0.1, *_REST, 0.4), Key(0.28, (0, -0.03, 0.05), (-14, 0, 0), 0.4),
+        *still(0.38, 0.6, (0, -0.03, 0.05), (-14, 0, 0), 0.85), Key(0.7, (0, -0.03, 0.05), (-14, 0, 0), 0.4),
+        *still(0.97, 1, *_REST, 0.4))),
 }  # fmt: skip
 # Sway of a carried object: rates, standard deviations of shift and rotation, and the height from which it is full.
 _SWAY_HZ, SWAY_M, SWAY_DEG, _CARRIED_M = (0.2, 0.6), 0.005, 4.0, 0.06
@@ -194,9 +154,8 @@ def with_sway(
 ) -> ObjectPath:
     """Add a slow sway to a carried object."""
     sway = minimum_jerk(path.shift_m[:, 2:] / _CARRIED_M) * waves(times, _SWAY_HZ, 6, rng)
-    return path._replace(
-        shift_m=path.shift_m + sway_m * sway[:, :3], rotation_rad=path.rotation_rad + np.deg2rad(sway_deg) * sway[:, 3:]
-    )
+    shift_m, rotation_rad = path.shift_m + sway_m * sway[:, :3], np.deg2rad(sway_deg) * sway[:, 3:]
+    return path._replace(shift_m=shift_m, rotation_rad=path.rotation_rad + rotation_rad)
 
 
 def waves(times: np.ndarray, rates_hz: tuple[float, float], width: int, rng: np.random.Generator) -> np.ndarray:

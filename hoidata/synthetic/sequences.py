@@ -187,10 +187,8 @@ def make_sequence(
     fps = SOURCE_FPS[dataset]
     times = np.arange(int(np.floor(timing.end * fps / FPS)) + 1) * (FPS / fps)
     hand = action.grasp.hand
-    size, rotation_scale = rng.uniform(*_SIZES), rng.uniform(0.9, 1.1)
-    path = follow_path(
-        action.motion, times, timing.start, timing.length, hand == "left", float(size), float(rotation_scale)
-    )
+    scales = float(rng.uniform(*_SIZES)), float(rng.uniform(0.9, 1.1))
+    path = follow_path(action.motion, times, timing.start, timing.length, hand == "left", *scales)
     rotmats, translation = object_pose(spec, model, with_sway(path, times, rng), rng)
     hinge = path.hinge_rad if model.is_articulated else None
     idle_absent = dataset == "h2o" and bool(rng.random() < 0.5)
@@ -313,14 +311,7 @@ def idle_hand(side: Side, person: Person, n_frames: int, rng: np.random.Generato
 def hand_track(person: Person, side: Side, wrist, orient, pose, present: bool) -> HandTrack:
     betas = person.betas if person.template_m is None else np.zeros(10)
     template = None if person.template_m is None else person.template_m[side]
-    return HandTrack(
-        wrist_m=wrist,
-        global_orient=orient,
-        hand_pose=pose,
-        betas=betas[None],
-        valid=np.full(len(wrist), present),
-        template_m=template,
-    )
+    return HandTrack(wrist, orient, pose, betas[None], valid=np.full(len(wrist), present), template_m=template)
 
 
 def make_person(dataset: str, subject: str, pair: HandPair, rng: np.random.Generator) -> Person:

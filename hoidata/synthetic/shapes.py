@@ -109,12 +109,8 @@ def _ring_quads(n_rings: int, sections: int, wrap: bool) -> np.ndarray:
     current = np.arange(sections)[None]
     following = (current + 1) % sections
     above = (ring + 1) % n_rings
-    corners = [
-        ring * sections + current,
-        ring * sections + following,
-        above * sections + following,
-        above * sections + current,
-    ]
+    pairs = ((ring, current), (ring, following), (above, following), (above, current))
+    corners = [row * sections + column for row, column in pairs]
     return np.stack(np.broadcast_arrays(*corners), axis=-1).reshape(-1, 4)
 
 
@@ -147,13 +143,8 @@ def united(*solids: Solid) -> Solid:
     """Unite closed solids to one closed surface, with the exact arithmetic of CGAL through libigl."""
     whole = solids[0]
     for solid in solids[1:]:
-        vertices, faces, _ = cgal.mesh_boolean(
-            whole.vertices_m,
-            np.ascontiguousarray(whole.faces),
-            solid.vertices_m,
-            np.ascontiguousarray(solid.faces),
-            "union",
-        )
+        meshes = [array for one in (whole, solid) for array in (one.vertices_m, np.ascontiguousarray(one.faces))]
+        vertices, faces, _ = cgal.mesh_boolean(*meshes, "union")
         whole = _welded(np.asarray(vertices), np.asarray(faces))
     return whole
 

@@ -61,21 +61,17 @@ def measure(truth: TruthSequence, pair: HandPair, hand_shift_m: np.ndarray | Non
     """Measure an action at 30 fps. hand_shift_m: (3,) translation of the active hands, for the negative control."""
     truth = truth.at_30_fps()
     lifted = np.flatnonzero(truth.lifted)
-    near: dict[Side, SignedDistance] = {
-        side: _distances(truth, side, pair, hand_shift_m) for side in truth.active_sides
-    }
-    penetration = np.max([-one.distance_m.min(1) for one in near.values()], axis=0).clip(0)
-    distances: dict[Side, np.ndarray] = {side: one.distance_m.min(1) for side, one in near.items()}
-    joints: dict[Side, np.ndarray] = {
-        side: _joint_distance(truth, side, pair, one, hand_shift_m) for side, one in near.items()
-    }
+    near, distances, joints = dict[Side, SignedDistance](), dict[Side, np.ndarray](), dict[Side, np.ndarray]()
+    for side in truth.active_sides:
+        near[side] = _distances(truth, side, pair, hand_shift_m)
+        distances[side] = near[side].distance_m.min(1)
+        joints[side] = _joint_distance(truth, side, pair, near[side], hand_shift_m)
+    penetration = np.max([-distance for distance in distances.values()], axis=0).clip(0)
     if truth.contact_by_side:
         distance, joint = _during_contact(truth, distances), _during_contact(truth, joints)
         idle_m, least_idle_m, clear = _near_idle(truth, pair), _NEAR_IDLE_M, _is_clear(truth, pair)
     else:
-        distance, joint = (
-            np.max([values[lifted] for values in by_side.values()], axis=0) for by_side in (distances, joints)
-        )
+        distance, joint = (np.max([d[lifted] for d in by_side.values()], axis=0) for by_side in (distances, joints))
         idle_m, least_idle_m, clear = _idle(truth, pair), _IDLE_M, True
     return Soundness(
         residual=_residuals(truth, near, pair, lifted),
@@ -104,13 +100,9 @@ def _near_idle(truth: TruthSequence, pair: HandPair) -> float:
 def vertex_distances_m(track: ObjectTrack, points_m: np.ndarray) -> np.ndarray:
     """Return (frame, point) distances of world points (frame, point, 3) to the nearest object vertex, metres."""
     model, local = track.model, track.world_from_object.inverse() @ points_m.astype(np.float64)
-    distances_m = [
-        KDTree(model.vertices_m[model.part == part]).query(
-            model.object_from_part(part, track.hinge_rad).inverse() @ local
-        )[0]
-        for part in model.parts
-    ]
-    return np.min(distances_m, axis=0)
+    in_parts = {part: model.object_from_part(part, track.hinge_rad).inverse() @ local for part in model.parts}
+    trees = {part: KDTree(model.vertices_m[model.part == part]) for part in model.parts}
+    return np.min([trees[part].query(points)[0] for part, points in in_parts.items()], axis=0)
 
 
 def _is_clear(truth: TruthSequence, pair: HandPair) -> bool:

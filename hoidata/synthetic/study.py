@@ -117,10 +117,8 @@ def find_grasps(task: PoolTask) -> Grasps:
     people = people_of(task.dataset, task.seed, task.size)
     stream = [task.seed, DATASET_IDS[task.dataset], _POOL_STREAM, task.object_index, names.index(task.region)]
     scene = Scene(region.standing(study_object.spec), model_of(study_object.spec), region.grasp.hinge_rad)
-    betas = np.stack([person.betas for person in people.values()])
-    grasps = search_pool(
-        scene, region.grasp, load_embedded_hands(), betas, np.random.default_rng(stream), _GRASPS, _ROUNDS, False
-    )
+    betas, rng = np.stack([person.betas for person in people.values()]), np.random.default_rng(stream)
+    grasps = search_pool(scene, region.grasp, load_embedded_hands(), betas, rng, _GRASPS, _ROUNDS, complete=False)
     return dict(zip(people, grasps, strict=True))
 
 
@@ -128,18 +126,13 @@ def clip_tasks(dataset: str, seed: int, size: StudySize, pools: dict[tuple[int, 
     """Return one task per object, verb and hands. pools: grasps by object index and region."""
     people = people_of(dataset, seed, size)
     grouped: dict[tuple, list[tuple[int, StudyEntry]]] = {}
+    grasps_of_object: dict[int, dict[str, Grasps]] = {}
     for position, entry in enumerate(study_plan(dataset, size)):
         grouped.setdefault((entry.object_index, entry.verb, entry.hand), []).append((position, entry))
-    return [
-        ClipTask(
-            dataset=dataset,
-            seed=seed,
-            entries=entries,
-            people=people,
-            grasps={name: grasps for (number, name), grasps in pools.items() if number == index},
-        )
-        for (index, _, _), entries in grouped.items()
-    ]
+    for (index, region), grasps in pools.items():
+        grasps_of_object.setdefault(index, {})[region] = grasps
+    tasks = [(entries, people, grasps_of_object[index]) for (index, _, _), entries in grouped.items()]
+    return [ClipTask(dataset, seed, *task) for task in tasks]
 
 
 def make_clips(task: ClipTask) -> list[tuple[int, TruthSequence]]:
@@ -164,24 +157,18 @@ def _sound_clip(task: ClipTask, entry: StudyEntry, pair: HandPair) -> TruthSeque
     key = grab_key if dataset == "grab" else entry.subject
     for regions in (*region_choices[entry.region :], *region_choices[: entry.region]):
         region_grasps = [task.grasps[region.name][entry.subject] for region in regions]
-        grasps = (
-            region_grasps[0]
-            if entry.verb != HANDOVER
-            else _handovers(study_object, regions, region_grasps, person, pair)
-        )
+        is_handover = entry.verb == HANDOVER
+        grasps = _handovers(study_object, regions, region_grasps, person, pair) if is_handover else region_grasps[0]
         grasps = grasps[:_MAX_GRASPS]
         first = int(rng.integers(max(1, len(grasps))))
         for attempt in range(len(_PLAYS) * len(grasps)):
             grips = grasps[(first + attempt) % len(grasps)]
-            scenario = Scenario(
-                dataset, study_object, entry.verb, regions[0], grips=grips, person=person, source_key=key, left=left
-            )
+            scenario = Scenario(dataset, study_object, entry.verb, regions[0], grips, person, source_key=key, left=left)
             truth = make_study_sequence(scenario, contact_frames, pair, _PLAYS[attempt // len(grasps)], rng)
             if measure(truth, pair).is_sound:
                 return truth
-    raise HoidataError(
-        f"{dataset}: {entry.verb} {study_object.spec.name} by {entry.subject} with {entry.hand}: no plausible clip"
-    )
+    what = f"{entry.verb} {study_object.spec.name} by {entry.subject} with {entry.hand}"
+    raise HoidataError(f"{dataset}: {what}: no plausible clip")
 
 
 def _handovers(
@@ -358,10 +345,8 @@ def _hinge(path: ObjectPath, verb: str, rng: np.random.Generator) -> np.ndarray:
 def _spans(scenario: Scenario, start: float, contact_frames: float) -> dict[Side, Span]:
     """Return the contact interval of each hand. In a handover, the right hand gives to the left."""
     if scenario.verb == HANDOVER:
-        return {
-            "right": (start, start + _RELEASED * contact_frames),
-            "left": (start + _RECEIVED * contact_frames, start + contact_frames),
-        }
+        received, released = start + _RECEIVED * contact_frames, start + _RELEASED * contact_frames
+        return {"right": (start, released), "left": (received, start + contact_frames)}
     return {grip.side: (start, start + contact_frames) for grip in scenario.grips}
 
 
@@ -372,10 +357,8 @@ def _idle_hand(
     far = idle_hand("left", person, len(times), rng, True)
     far = replace(far, wrist_m=far.wrist_m + _RAISED_M)
     random_kind = rng.random()
-    angle, target = (
-        np.deg2rad(rng.uniform(150, 230)),
-        rng.uniform(*(_RESTING_M if random_kind < _RESTS else _PASSING_M)),
-    )
+    angle = np.deg2rad(rng.uniform(150, 230))
+    target = rng.uniform(*(_RESTING_M if random_kind < _RESTS else _PASSING_M))
     yaw = rotvec_to_rotmat(np.array([0.0, 0.0, np.deg2rad(rng.uniform(-40, 25))]))
     middle, height = contact[0] + rng.uniform(0.3, 0.7) * (contact[1] - contact[0]), rng.uniform(0.035, 0.06)
     if random_kind >= _RESTS + _PASSES:
@@ -432,11 +415,5 @@ def mirrored_grip(grip: Grip, symmetry: np.ndarray) -> Grip:
     """Convert a right hand's grip to the left hand's grip on the mirrored object."""
     mirror = np.diag(MIRROR)
     pose, opened = (mirror_rotvec_x(one.reshape(-1, 15, 3)).reshape(-1, 45) for one in (grip.hand_pose, grip.open_pose))
-    return Grip(
-        side="left",
-        wrist_m=symmetry @ grip.wrist_m,
-        rotmat=symmetry @ grip.rotmat @ mirror,
-        hand_pose=pose,
-        open_pose=opened,
-        part=grip.part,
-    )
+    wrist_m, rotmat = symmetry @ grip.wrist_m, symmetry @ grip.rotmat @ mirror
+    return Grip("left", wrist_m, rotmat, hand_pose=pose, open_pose=opened, part=grip.part)

@@ -15,11 +15,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hoidata.clips.clip import HandType, Side
+from hoidata.clips.clip import SIDES, HandType
 from hoidata.synthetic.actions import DATASET_IDS
 from hoidata.synthetic.catalogue import ObjectSpec, box_at, hinged, hinged_behind, object_spec, tilted
 from hoidata.synthetic.grasps import Approach, GraspSpec
-from hoidata.synthetic.paths import Key, Motion, Swing
+from hoidata.synthetic.paths import Key, Motion, Swing, still, there_and_back
 from hoidata.synthetic.shapes import Solid, cylinder, revolved, rounded_box, united
 
 
@@ -72,7 +72,6 @@ class StudyObject:
 
 
 Vector = tuple[float, float, float]
-Reaches = tuple[tuple[Side, Approach], ...]
 
 
 def _one(name: str, direction: Vector, through: Vector | None, width=0.3, blend=(0.0, 0.8), yaw=0.0) -> Region:
@@ -81,11 +80,8 @@ def _one(name: str, direction: Vector, through: Vector | None, width=0.3, blend=
 
 def _two(name: str, left: tuple, right: tuple, yaw=0.0) -> Region:
     """left, right: (direction, target point) of each hand."""
-    approaches: Reaches = (
-        ("left", Approach(left[0], 0.25, left[1], (0, 0.7))),
-        ("right", Approach(right[0], 0.25, right[1], (0, 0.7))),
-    )
-    return Region(name, GraspSpec(approaches), yaw)
+    hands = (Approach(direction, 0.25, target, (0, 0.7)) for direction, target in (left, right))
+    return Region(name, GraspSpec(tuple(zip(SIDES, hands, strict=True))), yaw)
 
 
 def _lid(name: str, direction: Vector) -> Region:
@@ -94,11 +90,8 @@ def _lid(name: str, direction: Vector) -> Region:
 
 
 def _base_and_lid(name: str, base: Vector, lid: Vector) -> Region:
-    approaches: Reaches = (
-        ("left", Approach(base, 0.45, part=0)),
-        ("right", Approach(lid, 0.45, part=1)),
-    )
-    return Region(name, GraspSpec(approaches, ANGLES[0], ANGLES))
+    hands = (Approach(direction, 0.45, part=part) for part, direction in enumerate((base, lid)))
+    return Region(name, GraspSpec(tuple(zip(SIDES, hands, strict=True)), ANGLES[0], ANGLES))
 
 
 # Hinge angles, from closed to open, at which a grasp of the lid must be stable.
@@ -248,7 +241,7 @@ STUDY_OBJECTS = {"grab": GRAB_STUDY, "arctic": ARCTIC_STUDY}
 
 StudySize = Literal["study", "study-small"]
 _UP = (0.0, 0.0, 0.17)
-_TILTED = (-25.0, 0.0, 0.0)
+_REST, _TILTED = (0.0, 0.0, 0.0), (-25.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -265,68 +258,38 @@ class StudyVerb:
         return self.two_hands if hand == "both" and self.two_hands is not None else self.motion
 
 
-def _there_and_back(*middle: Key, swing: Swing | None = None) -> Motion:
-    return Motion((Key(0), Key(0.08), *middle, Key(0.96), Key(1)), swing)
-
-
 def _turned(degrees: float) -> Motion:
-    return Motion((Key(0), Key(0.15), Key(0.85, rotation_deg=(0, 0, degrees)), Key(1, rotation_deg=(0, 0, degrees))))
+    return Motion((Key(0), Key(0.15), *still(0.85, 1, _REST, (0, 0, degrees))))
 
 
 def _moving_lid(start: float, stop: float) -> tuple[Motion, Motion]:
     """Return the motions on the table, and lifted between two hands."""
-    up = (0.0, 0.0, 0.09)
-    on_table = (Key(0, hinge=start), Key(0.35, hinge=start), Key(0.65, hinge=stop), Key(1, hinge=stop))
-    lifted = (
-        Key(0, hinge=start), Key(0.1, hinge=start), Key(0.4, up, _TILTED, start), Key(0.62, up, _TILTED, stop),
-        Key(0.95, hinge=stop), Key(1, hinge=stop),
-    )  # fmt: skip
-    return Motion(on_table), Motion(lifted)
+    up, on_table = (0.0, 0.0, 0.09), (_REST, _REST)
+    lifted = (Key(0.4, up, _TILTED, start), Key(0.62, up, _TILTED, stop))
+    return (
+        Motion((*still(0, 0.35, *on_table, start), *still(0.65, 1, *on_table, stop))),
+        Motion((*still(0, 0.1, *on_table, start), *lifted, *still(0.95, 1, *on_table, stop))),
+    )
 
 
-_POURED, _DRUNK = Key(0.45, (-0.06, 0.05, 0.2), (0, -80, 0)), Key(0.44, (0, -0.18, 0.26), (42, 0, 0))
-_SHOWN = Key(0.2, (0, -0.1, 0.17))
+_SHOWN = (0, -0.1, 0.17)
 VERBS = {
-    "lift": StudyVerb("lift", 52, _there_and_back(Key(0.45, (0, 0, 0.2)), Key(0.6, (0, 0, 0.2)))),
-    "place": StudyVerb(
-        "place", 50,
-        Motion((Key(0), Key(0.1), Key(0.35, (0.05, 0.02, 0.07)), Key(0.65, (0.15, 0.06, 0.07)),
-                Key(0.92, (0.2, 0.07, 0)), Key(1, (0.2, 0.07, 0)))),
-        heading_deg=30,
-    ),
-    "push": StudyVerb("push", 42, Motion((Key(0), Key(0.15), Key(0.85, (0, 0.16, 0)), Key(1, (0, 0.16, 0)))),
-                      heading_deg=50),
+    "lift": StudyVerb("lift", 52, there_and_back(*still(0.45, 0.6, (0, 0, 0.2)))),
+    "place": StudyVerb("place", 50, Motion((Key(0), Key(0.1), Key(0.35, (0.05, 0.02, 0.07)),
+        Key(0.65, (0.15, 0.06, 0.07)), *still(0.92, 1, (0.2, 0.07, 0)))), heading_deg=30),
+    "push": StudyVerb("push", 42, Motion((Key(0), Key(0.15), *still(0.85, 1, (0, 0.16, 0)))), heading_deg=50),
     "turn": StudyVerb("turn", 44, _turned(70)),
-    "pass": StudyVerb(
-        "pass", 54,
-        Motion((Key(0), Key(0.1), Key(0.42, (0, 0.1, 0.17)), Key(0.62, (0, 0.18, 0.17)), Key(0.93, (0, 0.25, 0)),
-                Key(1, (0, 0.25, 0)))),
-        heading_deg=20,
-    ),
-    "pour": StudyVerb(
-        "pour", 76, _there_and_back(Key(0.26, _UP), _POURED, _POURED._replace(phase=0.7), Key(0.84, (0, 0, 0.14)))
-    ),
-    "drink": StudyVerb(
-        "drink", 80,
-        _there_and_back(Key(0.28, (0, -0.12, 0.22)), _DRUNK, _DRUNK._replace(phase=0.66), Key(0.8, (0, -0.12, 0.2))),
-    ),
-    "shake": StudyVerb(
-        "shake", 72, _there_and_back(Key(0.22, _UP), Key(0.8, _UP), swing=Swing(0.22, 0.8, 4, (0, 0, 0.03)))
-    ),
-    "inspect": StudyVerb(
-        "inspect", 84,
-        _there_and_back(
-            _SHOWN, _SHOWN._replace(phase=0.38, rotation_deg=(18, 0, 60)),
-            _SHOWN._replace(phase=0.62, rotation_deg=(18, 0, -60)),
-            _SHOWN._replace(phase=0.78),
-        ),
-    ),
-    "hand over": StudyVerb(
-        "offhand", 88,
-        Motion((Key(0), Key(0.08), Key(0.32, (-0.05, 0, 0.15)), Key(0.68, (-0.05, 0.02, 0.15)),
-                Key(0.92, (-0.14, 0.05, 0)), Key(1, (-0.14, 0.05, 0)))),
-        heading_deg=20,
-    ),
+    "pass": StudyVerb("pass", 54, Motion((Key(0), Key(0.1), Key(0.42, (0, 0.1, 0.17)), Key(0.62, (0, 0.18, 0.17)),
+        *still(0.93, 1, (0, 0.25, 0)))), heading_deg=20),
+    "pour": StudyVerb("pour", 76, there_and_back(Key(0.26, _UP), *still(0.45, 0.7, (-0.06, 0.05, 0.2), (0, -80, 0)),
+        Key(0.84, (0, 0, 0.14)))),
+    "drink": StudyVerb("drink", 80, there_and_back(Key(0.28, (0, -0.12, 0.22)),
+        *still(0.44, 0.66, (0, -0.18, 0.26), (42, 0, 0)), Key(0.8, (0, -0.12, 0.2)))),
+    "shake": StudyVerb("shake", 72, there_and_back(*still(0.22, 0.8, _UP), swing=Swing(0.22, 0.8, 4, (0, 0, 0.03)))),
+    "inspect": StudyVerb("inspect", 84, there_and_back(Key(0.2, _SHOWN), Key(0.38, _SHOWN, (18, 0, 60)),
+        Key(0.62, _SHOWN, (18, 0, -60)), Key(0.78, _SHOWN))),
+    "hand over": StudyVerb("offhand", 88, Motion((Key(0), Key(0.08), Key(0.32, (-0.05, 0, 0.15)),
+        Key(0.68, (-0.05, 0.02, 0.15)), *still(0.92, 1, (-0.14, 0.05, 0)))), heading_deg=20),
     "open": StudyVerb("open", 54, *_moving_lid(0, 1)),
     "close": StudyVerb("close", 50, *_moving_lid(1, 0)),
     "screw": StudyVerb("screw", 44, _turned(-70)),
@@ -435,6 +398,4 @@ def _numbered(pairs) -> Iterator[StudyEntry]:
     done: Counter[tuple] = Counter()
     for subject, (index, verb, hand, region) in pairs:
         done[subject, index, verb] += 1
-        yield StudyEntry(
-            subject=subject, object_index=index, verb=verb, hand=hand, region=region, number=done[subject, index, verb]
-        )
+        yield StudyEntry(subject, index, verb, hand, region=region, number=done[subject, index, verb])

@@ -14,7 +14,7 @@ from hoidata.clips.clip import SIDES, HandTrack, Side
 from hoidata.hands import HandPair
 from hoidata.synthetic.catalogue import ObjectSpec, model_of
 from hoidata.synthetic.generate import GAP_FRAMES
-from hoidata.synthetic.object_files import obj_text, write_npy, write_text
+from hoidata.synthetic.object_files import gender, obj_text, write_npy, write_text
 from hoidata.synthetic.truth import TruthSequence
 
 MM_PER_M = 1000.0
@@ -47,11 +47,8 @@ def write_arctic_meta(root: Path, sequences: list[TruthSequence], specs: tuple[O
 def _part_parameters(name: str, vertices: np.ndarray) -> dict[str, list]:
     low, high = vertices.min(0), vertices.max(0)
     points = vertices[np.linspace(0, len(vertices) - 1, 16).astype(int)].tolist()
-    return {
-        f"mocap_{name}": points[:4],
-        f"bbox_{name}": list(product(*zip(low.tolist(), high.tolist(), strict=True))),
-        f"keypoints_{name}": points,
-    }
+    box = list(product(*zip(low.tolist(), high.tolist(), strict=True)))
+    return {f"mocap_{name}": points[:4], f"bbox_{name}": box, f"keypoints_{name}": points}
 
 
 def _misc(sequences: list[TruthSequence]) -> dict[str, dict]:
@@ -60,7 +57,7 @@ def _misc(sequences: list[TruthSequence]) -> dict[str, dict]:
     sizes = [[2800, 2000]] * 9
     return {
         subject: {
-            "gender": "male" if int(subject[1:]) % 2 else "female", "world2cam": cameras, "intris_mat": intrinsics,
+            "gender": gender(subject), "world2cam": cameras, "intris_mat": intrinsics,
             "image_size": sizes, "ioi_offset": 0,
         }
         for subject in sorted({truth.subject for truth in sequences})

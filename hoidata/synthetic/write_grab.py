@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from hoidata.clips.clip import SIDES, HandTrack, Side
 from hoidata.hands import HandPair, load_embedded_hands, track_vertices
 from hoidata.synthetic.catalogue import ObjectSpec, model_of
-from hoidata.synthetic.object_files import write_npz, write_ply
+from hoidata.synthetic.object_files import gender, write_npz, write_ply
 from hoidata.synthetic.shapes import sharp_box
 from hoidata.synthetic.truth import TruthSequence
 
@@ -51,42 +51,31 @@ def _template(track: HandTrack) -> np.ndarray:
     return track.template_m
 
 
-def _gender(subject: str) -> str:
-    return "male" if int(subject[1:]) % 2 else "female"
-
-
 def _template_path(subject: str, side: Side) -> str:
-    return f"tools/subject_meshes/{_gender(subject)}/{subject}_{side[0]}hand.ply"
+    return f"tools/subject_meshes/{gender(subject)}/{subject}_{side[0]}hand.ply"
 
 
 def write_grab_sequence(root: Path, members: list[TruthSequence], pair: HandPair) -> None:
     """Write grab/<subject>/<object>_<intent>_<n>.npz. A recording of GRAB is one action."""
     (truth,) = members
-    body = {
-        "params": _body(truth.n_frames),
-        "vtemp": f"tools/subject_meshes/{_gender(truth.subject)}/{truth.subject}.ply",
-    }
+    body_mesh = f"tools/subject_meshes/{gender(truth.subject)}/{truth.subject}.ply"
     arrays: dict[str, Any] = {
-        "gender": _gender(truth.subject),
+        "gender": gender(truth.subject),
         "sbj_id": truth.subject,
         "obj_name": truth.object_name,
         "motion_intent": truth.intent,
         "framerate": 120.0,
         "n_frames": truth.n_frames,
         "n_comps": _COMPONENTS,
-        "body": body,
+        "body": {"params": _body(truth.n_frames), "vtemp": body_mesh},
     }
     for side in SIDES:
-        arrays[f"{side[0]}hand"] = {
-            "params": _hand_parameters(truth.hands[side], pair, side),
-            "vtemp": _template_path(truth.subject, side),
-        }
+        parameters = _hand_parameters(truth.hands[side], pair, side)
+        arrays[f"{side[0]}hand"] = {"params": parameters, "vtemp": _template_path(truth.subject, side)}
     arrays["object"] = {"params": _object_parameters(truth), "object_mesh": f"{_MESHES}/{truth.object_name}.ply"}
     arrays["table"] = {"params": _table_parameters(truth), "table_mesh": f"{_MESHES}/table.ply"}
-    arrays["contact"] = {
-        "object": _object_contact(truth, pair),
-        "body": np.zeros((truth.n_frames, _BODY_VERTICES), dtype=np.int8),
-    }
+    no_contact = np.zeros((truth.n_frames, _BODY_VERTICES), dtype=np.int8)
+    arrays["contact"] = {"object": _object_contact(truth, pair), "body": no_contact}
     write_npz(root / "grab" / f"{truth.source_key}.npz", arrays)
 
 
@@ -99,12 +88,8 @@ def _hand_parameters(track: HandTrack, pair: HandPair, side: Side) -> dict[str, 
     rest_wrist = pair[side].rest_joints_m(np.zeros((1, 10)), track.template_m)[0, 0]
     # The components are orthonormal, so the projection onto 24 components is the closest pose.
     projected = track.hand_pose @ pair[side].components[:_COMPONENTS].T
-    parameters = {
-        "global_orient": track.global_orient,
-        "hand_pose": projected,
-        "transl": track.wrist_m - rest_wrist,
-        "fullpose": track.hand_pose,
-    }
+    parameters = {"global_orient": track.global_orient, "hand_pose": projected}
+    parameters |= {"transl": track.wrist_m - rest_wrist, "fullpose": track.hand_pose}
     return {name: value.astype(np.float32) for name, value in parameters.items()}
 
 

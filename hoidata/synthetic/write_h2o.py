@@ -144,6 +144,5 @@ def _object_blocks(
     points = np.concatenate([[(low + high) / 2], corners, edges])
     points_camera_m = points @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3]
     kind = np.full((n_frames, 1), float(H2O_OBJECT_IDS[truth.object_name]))
-    return np.concatenate([kind, pose.reshape(n_frames, 16)], 1), np.concatenate(
-        [kind, points_camera_m.reshape(n_frames, 63)], 1
-    )
+    numbers = pose.reshape(n_frames, 16), points_camera_m.reshape(n_frames, 63)
+    return np.concatenate([kind, numbers[0]], 1), np.concatenate([kind, numbers[1]], 1)

@@ -23,11 +23,8 @@ from hoidata.objects.mesh import Mesh
 from hoidata.objects.model import Hinge, ObjectModel
 
 EXCLUDED = {("write", "notebook"), ("operate", "waffleiron"), ("push", "capsulemachine")}  # as in Text2HOI
-OBJECT_WORDS = {
-    "capsulemachine": "capsule machine",
-    "espressomachine": "espresso machine",
-    "waffleiron": "waffle iron",
-}
+OBJECT_WORDS = {f"{kind}{noun}": f"{kind} {noun}"
+                for kind, noun in (("capsule", "machine"), ("espresso", "machine"), ("waffle", "iron"))}  # fmt: skip
 OBJECTS = ("box", "capsulemachine", "espressomachine", "ketchup", "laptop", "microwave", "mixer", "notebook", "phone",
            "scissors", "waffleiron")  # fmt: skip
 VERBS = ("close", "cut", "grasp", "lift", "open", "operate", "place", "point", "shake", "sprinkle", "type")
@@ -175,12 +172,9 @@ TOP_FOLDERS = ("", "data/", "arctic_data/data/")
 PARTS_ALIGNED_MM = 5.0  # tolerance: top.obj and bottom.obj have another topology than mesh.obj
 HINGE_AXIS = (0.0, 0.0, -1.0)
 FRAME = WorldFrame("+z", "stated", "ARCTIC's motion-capture world, right-handed, z up, metres")
+HAND_NOTE = "MANO: axis-angles relative to the mean pose, betas per sequence, translation added to the rest wrist"
 CONVENTION = HandConvention(
-    translation="transl",
-    fingers="mean-relative",
-    shape="betas per sequence",
-    left_shape="as released",
-    note="MANO: axis-angles relative to the mean pose, betas per sequence, translation added to the rest wrist",
+    translation="transl", fingers="mean-relative", shape="betas per sequence", left_shape="as released", note=HAND_NOTE
 )
 
 
@@ -431,17 +425,12 @@ def _parts_joined(parts: list[Mesh], part_paths: list[str], whole: Mesh, whole_p
     Raises BadInput if their bounding box differs from that of the whole object's mesh.
     """
     base, moving = parts
-    joined = Mesh(
-        np.concatenate([base.vertices, moving.vertices]),
-        np.concatenate([base.faces, moving.faces + len(base.vertices)]),
-    )
+    faces = np.concatenate([base.faces, moving.faces + len(base.vertices)])
+    joined = Mesh(np.concatenate([base.vertices, moving.vertices]), faces)
     boxes = [np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]) for mesh in (joined, whole)]
     difference_mm = float(np.abs(boxes[0] - boxes[1]).max())
     if difference_mm > PARTS_ALIGNED_MM:
-        raise BadInput(
-            ", ".join(part_paths),
-            f"parts with the bounding box of {whole_path}, within {PARTS_ALIGNED_MM:g} mm",
-            f"a difference of {difference_mm:.3g} mm",
-            "remove both files to use mesh.obj and parts.json, or download them again",
-        )
+        expected = f"parts with the bounding box of {whole_path}, within {PARTS_ALIGNED_MM:g} mm"
+        remedy = "remove both files to use mesh.obj and parts.json, or download them again"
+        raise BadInput(", ".join(part_paths), expected, f"a difference of {difference_mm:.3g} mm", remedy)
     return joined, np.arange(len(joined.vertices)) < len(base.vertices)

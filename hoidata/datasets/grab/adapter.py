@@ -80,12 +80,9 @@ PAIRS = tuple(
 )
 # Further meshes in GRAB's folder of objects.
 OTHER_MESHES = {
-    "coffeemug": "coffee mug",
-    "cubemiddle": "middle cube",
-    "rubberduck": "rubber duck",
-    "table": "table",
+    "coffeemug": "coffee mug", "cubemiddle": "middle cube", "rubberduck": "rubber duck", "table": "table",
     "wristwatch": "wristwatch",
-}
+}  # fmt: skip
 _BEFORE_CAPITAL = re.compile(r"(?<=[a-z])(?=[A-Z])|[_\s-]+")
 
 
@@ -101,26 +98,16 @@ def object_words(name: str) -> str:
 
 TOP_FOLDERS = ("", "GRAB")
 FRAME = WorldFrame("+z", "stated", "GRAB's motion-capture world, right-handed, z up, metres")
+HAND_NOTE = "MANO: absolute axis-angles, the subject's own rest mesh without betas, translation added to its rest wrist"
 CONVENTION = HandConvention(
-    translation="transl",
-    fingers="absolute",
-    shape="personal mesh",
-    left_shape="unused",
-    note="MANO: absolute axis-angles, the subject's own rest mesh without betas, translation added to its rest wrist",
+    translation="transl", fingers="absolute", shape="personal mesh", left_shape="unused", note=HAND_NOTE
 )
-PARTS = (
-    DatasetPart("sequences", ("grab/s*/*.npz", "GRAB/grab/s*/*.npz"), "grab__s1.zip to grab__s10.zip"),
-    DatasetPart(
-        "meshes of objects and table",
-        ("tools/object_meshes/*/*.ply", "GRAB/tools/object_meshes/*/*.ply"),
-        "object_meshes.zip",
-    ),
-    DatasetPart(
-        "the subjects' hand meshes",
-        ("tools/subject_meshes/*/*.ply", "GRAB/tools/subject_meshes/*/*.ply"),
-        "tools__subject_meshes.zip",
-    ),
+_FILES = (
+    ("sequences", "grab/s*/*.npz", "grab__s1.zip to grab__s10.zip"),
+    ("meshes of objects and table", "tools/object_meshes/*/*.ply", "object_meshes.zip"),
+    ("the subjects' hand meshes", "tools/subject_meshes/*/*.ply", "tools__subject_meshes.zip"),
 )
+PARTS = tuple(DatasetPart(name, (pattern, f"GRAB/{pattern}"), archive) for name, pattern, archive in _FILES)
 MEMBERS = ("obj_name", "motion_intent", "framerate", "n_frames", "lhand", "rhand", "object")
 MAX_COMPONENTS = 45
 

@@ -116,9 +116,7 @@ class H2OAdapter(AdapterBase):
         hand_source = ParameterHands(frames, hands) if self.needs_mano else KeypointHands(frames, hands)
         gravity = estimate_gravity(_tracked_objects(frames, objects), hand_source.joints_m(), frames.camera[:, :3, :3])
         sources = raw.recorded(frames.folder, LISTS, *paths.values())
-        sequence = _Sequence(
-            key=key, frames=frames, hands=hand_source, objects=objects, gravity=gravity, sources=sources
-        )
+        sequence = _Sequence(key, frames, hand_source, objects, gravity=gravity, sources=sources)
         return [item if isinstance(item, Quarantined) else self._clip(sequence, item) for item in runs_and_reasons]
 
     def _runs(self, raw: RawTree, key: SequenceKey, frames: SequenceFrames) -> Iterator[_Run | Quarantined]:
@@ -132,11 +130,9 @@ class H2OAdapter(AdapterBase):
                         raise BadInput(location, "each stretch once", f"{clip_id} twice", "correct the list")
                     earlier_intervals.add((piece.start, piece.stop))
                     yield piece
-                tracked, inside = frames.classes == frames.classes[piece.start], slice(start, stop)
-                numbers, noun = frames.first + np.arange(len(frames))[inside], OBJECTS[frames.classes[piece.start]]
-                yield from missing_poses(
-                    f"{clip_id}/missing", f"{frames.folder}/obj_pose_rt", noun, numbers, tracked[inside]
-                )
+                tracked = frames.classes[start:stop] == frames.classes[piece.start]
+                numbers, noun = frames.first + np.arange(start, stop), OBJECTS[frames.classes[piece.start]]
+                yield from missing_poses(f"{clip_id}/missing", f"{frames.folder}/obj_pose_rt", noun, numbers, tracked)
             except BadInput as problem:
                 yield Quarantined.from_error(clip_id, problem)
 
@@ -223,13 +219,9 @@ def _tracked_pieces(
     has_target_pose = has_pose(classes == target_class) & np.isin(classes, (0, target_class))
     accepted = [(first, last) for first, last in runs(has_target_pose) if last - first >= shortest]
     if not class_counts.any() or not accepted:
-        object_in_words = (
-            "one object"
-            if label is None
-            else f"class {target_class} ({OBJECTS[target_class]}), the object of action {label},"
-        )
+        of_label = f"class {target_class} ({OBJECTS[target_class]}), the object of action {label},"
         got = f"classes {np.unique(classes).tolist()} ({named_frames})"
-        expected = f"{object_in_words} for {shortest} frames or more"
+        expected = f"{'one object' if label is None else of_label} for {shortest} frames or more"
         raise BadInput(f"{frames.folder}/obj_pose_rt", expected, got, "check the annotation")
     verb = None if label is None else ACTIONS[label][0]
     return [_Run(start + first, start + last, verb, OBJECTS[target_class]) for first, last in accepted]

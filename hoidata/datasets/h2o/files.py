@@ -16,9 +16,10 @@ from hoidata.clips.clip import SIDES, HandTrack, Side
 from hoidata.clips.hand_parameters import FrameChange, HandConvention, SourceHand, hand_track, to_track
 from hoidata.datasets import checks
 from hoidata.datasets.base import RawTree
+from hoidata.datasets.gravity import hand_joints_m
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import runs
-from hoidata.hands import HandPair, track_joints
+from hoidata.hands import HandPair
 from hoidata.hands.fitting import fit_hands, fit_shape
 from hoidata.hands.model import openpose_to_mano_order
 
@@ -77,8 +78,6 @@ class Segment(NamedTuple):
     label: int | None  # action; None if it is withheld
     start: int  # first frame of the action
     last: int  # last frame of the action, inclusive
-    first_frame: int  # of the sequence
-    last_frame: int  # of the sequence, inclusive
 
 
 def read_frames(raw: RawTree, folder: str, hands: HandSource) -> SequenceFrames:
@@ -87,9 +86,7 @@ def read_frames(raw: RawTree, folder: str, hands: HandSource) -> SequenceFrames:
     kinds = {kind: _folder_of(raw, folder, kind) for kind in ("cam_pose", hand_folder, "obj_pose_rt", "action_label")}
     labelled = bool(_frame_files(raw, kinds["action_label"]))
     _refuse_other_hands(raw, folder, kinds[hand_folder], hands)
-    files = _common_files(
-        raw, [folder_path for kind, folder_path in kinds.items() if labelled or kind != "action_label"]
-    )
+    files = _common_files(raw, [path for kind, path in kinds.items() if labelled or kind != "action_label"])
     camera = _read(raw, kinds["cam_pose"], files, 16).reshape(-1, 4, 4)
     objects = _read(raw, kinds["obj_pose_rt"], files, 17)
     hand_numbers = _read(raw, kinds[hand_folder], files, hand_columns)
@@ -248,23 +245,17 @@ def _segment(header: list[str], words: list[str], location: str) -> Segment:
         raise BadInput(location, f"an action label from 1 to {len(ACTIONS) - 1}", f"{label}")
     if numbers["start_act"] > numbers["end_act"]:
         raise BadInput(location, "a first frame before the last", f"{numbers['start_act']} to {numbers['end_act']}")
-    return Segment(path, label, *(numbers[name] for name in _LIST_COLUMNS[3:]))
+    return Segment(path, label, numbers["start_act"], numbers["end_act"])
 
 
+PARAMETERS_NOTE = (
+    "MANO in the camera's frame: absolute axis-angles, betas per frame, translation added to the rest wrist"
+)
 PARAMETERS = HandConvention(
-    translation="transl",
-    fingers="absolute",
-    shape="betas per frame",
-    left_shape="as released",
-    note="MANO in the camera's frame: absolute axis-angles, betas per frame, translation added to the rest wrist",
+    translation="transl", fingers="absolute", shape="betas per frame", left_shape="as released", note=PARAMETERS_NOTE
 )
-FITTED = HandConvention(
-    translation="wrist",
-    fingers="absolute",
-    shape="fitted",
-    left_shape="unused",
-    note="21 joints in the camera's frame: a MANO-layout hand was fitted to them, one shape per sequence",
-)
+FITTED_NOTE = "21 joints in the camera's frame: a MANO-layout hand was fitted to them, one shape per sequence"
+FITTED = HandConvention(translation="wrist", fingers="absolute", shape="fitted", left_shape="unused", note=FITTED_NOTE)
 _PARAMETERS, _KEYPOINTS = 62, 64  # numbers of one hand; left comes first
 
 
@@ -281,12 +272,7 @@ class ParameterHands:
 
     def joints_m(self) -> np.ndarray:
         """(frame, 42, 3) joints of left and right hand in the world, metres; NaN if a hand is not annotated."""
-        return np.concatenate([self._side_joints_m(side) for side in SIDES], axis=1)
-
-    def _side_joints_m(self, side: Side) -> np.ndarray:
-        track = self._track(side, slice(None))
-        joints = track_joints(track, self.models[side]).astype(np.float64)
-        return np.where(track.valid[:, None, None], joints, np.nan)
+        return hand_joints_m({side: self._track(side, slice(None)) for side in SIDES}, self.models)
 
     def _track(self, side: Side, rows: slice) -> HandTrack:
         numbers = self.frames.hands[rows]
@@ -302,9 +288,10 @@ class KeypointHands:
     def __init__(self, frames: SequenceFrames, models: HandPair) -> None:
         self.models = models
         self.points: dict[Side, np.ndarray] = {side: _world_joints(frames, side) for side in SIDES}
-        valid_points: dict[Side, np.ndarray] = {side: self.points[side][_is_valid(self.points[side])] for side in SIDES}
-        present_points: dict[Side, np.ndarray] = {side: valid_points[side] for side in SIDES if len(valid_points[side])}
-        self.betas = fit_shape(present_points, models) if present_points else np.zeros(10)
+        valid_points: dict[Side, np.ndarray] = {
+            side: points[valid] for side, points in self.points.items() if (valid := _is_valid(points)).any()
+        }
+        self.betas = fit_shape(valid_points, models) if valid_points else np.zeros(10)
 
     def joints_m(self) -> np.ndarray:
         """(frame, 42, 3) joints of left and right hand in the world, metres; NaN if a hand is not annotated."""
@@ -312,10 +299,9 @@ class KeypointHands:
 
     def tracks(self, start: int, stop: int) -> tuple[dict[Side, HandTrack], float | None]:
         """Fitted hands of frames ``start`` to ``stop`` (exclusive), and the mean fit error in metres."""
-        tracks: dict[Side, HandTrack] = {}
-        errors = []
-        for side in SIDES:
-            tracks[side], error = self._fit(side, self.points[side][start:stop])
+        tracks, errors = dict[Side, HandTrack](), []
+        for side, points in self.points.items():
+            tracks[side], error = self._fit(side, points[start:stop])
             errors.append(error)
         all_errors = np.concatenate(errors)
         return tracks, float(all_errors.mean()) if len(all_errors) else None

@@ -4,7 +4,7 @@ All numbers are in the camera's frame. The world is that of the camera's traject
 Clips have 30 frames per second, of which every second one is interpolated (``parts.upsample_frames``).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from hoidata.clips.hand_parameters import FrameChange, HandConvention, SourceHan
 from hoidata.dataset_folders import facts_of_adapter
 from hoidata.datasets.base import AdapterBase, DatasetPart, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.gaps import bridge, has_pose, mark_interpolated, missing_poses, trim_to_recorded
-from hoidata.datasets.gravity import TrackedObject, estimate_gravity
+from hoidata.datasets.gravity import TrackedObject, estimate_gravity, hand_joints_m
 from hoidata.datasets.hinge import box_corners, fit_hinge, hinged_model
 from hoidata.datasets.hoi4d.files import (
     CATEGORIES,
@@ -43,23 +43,18 @@ from hoidata.datasets.segments import ClipSource, has_description, segment_clips
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import runs
 from hoidata.geometry.rotations import rotmat_to_rotvec
-from hoidata.hands import HandPair, track_joints
+from hoidata.hands import HandPair
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.objects.resting import footing
 
 ANNOTATIONS, MODELS = "HOI4D_annotations", "HOI4D_CAD_Model_for_release"
 CLIP = "ZY*/H*/C*/N*/S*/s*/T*"
-HAND_FOLDERS = (
-    "handpose/refinehandpose_{}",
-    "Hand_pose/handpose_{}_hand",
-)  # of an older download and of the current one
+# Of an older download and of the current one.
+HAND_FOLDERS = ("handpose/refinehandpose_{}", "Hand_pose/handpose_{}_hand")
 FRAME = WorldFrame(None, "estimated", "the world of the camera's trajectory, right-handed, metres, axes not documented")
+HAND_NOTE = "MANO: absolute axis-angles, one shape per person, translation added to the rest wrist, camera frame"
 CONVENTION = HandConvention(
-    translation="transl",
-    fingers="absolute",
-    shape="betas per sequence",
-    left_shape="as released",
-    note="MANO: absolute axis-angles, one shape per person, translation added to the rest wrist, camera frame",
+    translation="transl", fingers="absolute", shape="betas per sequence", left_shape="as released", note=HAND_NOTE
 )
 # A folder of frame files is recorded as one source, so a pattern for the folder is needed too.
 _HANDS = tuple(
@@ -169,9 +164,8 @@ class Hoi4dAdapter(AdapterBase):
             inside, location = slice(start, stop), f"{ANNOTATIONS}/{whole.sequence}/objpose"
             with_pose = [(start + a, start + b) for a, b in runs(has_pose(object_motion.tracked)[inside])]
             pieces = [trim_to_recorded(piece, object_motion.recorded) for piece in with_pose]
-            yield from missing_poses(
-                f"{item.clip_id}/missing", location, "the object", source_frames[inside], object_motion.tracked[inside]
-            )
+            frames_and_tracked = source_frames[inside], object_motion.tracked[inside]
+            yield from missing_poses(f"{item.clip_id}/missing", location, "the object", *frames_and_tracked)
             accepted = [piece for piece in pieces if piece[1] - piece[0] >= self.shortest_frames]
             if not accepted:
                 got = f"{max((b - a for a, b in pieces), default=0)} in frames {item.start} to {item.stop - 1}"
@@ -222,10 +216,7 @@ class Hoi4dAdapter(AdapterBase):
                 raise BadInput(f"{folder}/{name}", f"the parts {', '.join(labels)}", got)
         tracked = np.zeros(len(camera), bool)
         tracked[frames] = True
-        boxes = [
-            camera[frames] @ _transforms([frame_poses[number] for frame_poses in poses])
-            for number in range(len(labels))
-        ]
+        boxes = [camera[frames] @ _transforms(part_poses) for part_poses in zip(*poses, strict=True)]
         extents = np.array([pose.extents_m for pose in poses[0]])
         build = self._hinged if category.hinged else _rigid
         return build(raw, key, category, extents, boxes, tracked)
@@ -240,25 +231,16 @@ class Hoi4dAdapter(AdapterBase):
         tracked: np.ndarray,
     ) -> _ObjectMotion:
         location = f"{ANNOTATIONS}/{key.name}/objpose"
-        model, names, whole_from = _hinged_model(raw, category, _instance(key))
-        corners = [model.vertices_m[model.part == part] for part in (0, 1)]
-        aligned = [
-            vertices @ aligned_from_whole[:3, :3].T + aligned_from_whole[:3, 3]
-            for vertices, aligned_from_whole in zip(corners, whole_from, strict=True)
-        ]
-        chosen, ratio = match_boxes(
-            location, extents_m, names, np.array([np.ptp(vertices, axis=0) for vertices in aligned])
-        )
-        world_from_whole = [
-            boxes[box] @ aligned_from_whole for box, aligned_from_whole in zip(chosen, whole_from, strict=True)
-        ]
+        model, names, aligned_from_whole = _hinged_model(raw, category, _instance(key))
+        parts = [model.vertices_m[model.part == part] for part in (0, 1)]
+        aligned = [part @ pose[:3, :3].T + pose[:3, 3] for part, pose in zip(parts, aligned_from_whole, strict=True)]
+        chosen, ratio = match_boxes(location, extents_m, names, np.array([np.ptp(part, axis=0) for part in aligned]))
+        base, moving = (boxes[box] @ pose for box, pose in zip(chosen, aligned_from_whole, strict=True))
         assert model.hinge is not None
-        fit = fit_hinge(
-            world_from_whole[0], world_from_whole[1], model.hinge, (box_corners(corners[0]), box_corners(corners[1]))
-        )
-        frames, off = np.flatnonzero(tracked), fit.exceeds(self.most_off_mm, self.most_off_deg)
-        tracked[frames[off]] = False
+        fit = fit_hinge(base, moving, model.hinge, (box_corners(parts[0]), box_corners(parts[1])))
         limits = (self.most_off_mm, self.most_off_deg)
+        frames, off = np.flatnonzero(tracked), fit.exceeds(*limits)
+        tracked[frames[off]] = False
         rejected = [fit.rejected_frames_reason(f"{key}/hinge", location, frames, *limits)] if off.any() else []
         note = f"{fit.note}; {_box_note(ratio, aligned)}"
         return _object_motion(model, fit.world_from_object, fit.hinge_rad, frames, tracked, note, rejected)
@@ -282,7 +264,7 @@ def _instance(key: SequenceKey) -> str:
     return f"{int(number):03d}"
 
 
-def _transforms(poses: list[PartPose]) -> np.ndarray:
+def _transforms(poses: Sequence[PartPose]) -> np.ndarray:
     """(frame, 4, 4) camera from the part's mesh."""
     transforms = np.tile(np.eye(4), (len(poses), 1, 1))
     transforms[:, :3, :3] = [pose.rotation for pose in poses]
@@ -301,9 +283,8 @@ def _rigid(
     number = _instance(key)
     mesh = raw_mesh(raw, f"{MODELS}/rigid/{category.folder}/{number}.obj")
     name = f"{category.folder.lower()}_{number}"
-    (chosen,), ratio = match_boxes(
-        f"{ANNOTATIONS}/{key.name}/objpose", extents_m, [name], np.ptp(mesh.vertices, axis=0)[None]
-    )
+    location = f"{ANNOTATIONS}/{key.name}/objpose"
+    (chosen,), ratio = match_boxes(location, extents_m, [name], np.ptp(mesh.vertices, axis=0)[None])
     model = ObjectModel(name, mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), np.uint8))
     note = _box_note(ratio, [mesh.vertices])
     return _object_motion(model, boxes[chosen], None, np.flatnonzero(tracked), tracked, note, [])
@@ -328,12 +309,9 @@ def _hinged_model(raw: RawTree, category: Category, number: str) -> tuple[Object
 
 def _box_note(ratio: np.ndarray, aligned_m: list[np.ndarray]) -> str:
     """Compare annotated boxes with the meshes, in words. Meshes are not resized."""
-    centre_offset_m = max(
-        float(np.linalg.norm((vertices.min(axis=0) + vertices.max(axis=0)) / 2)) for vertices in aligned_m
-    )
-    return (
-        f"boxes {ratio.min():.2f} to {ratio.max():.2f} of the mesh, whose middle is {1000 * centre_offset_m:.1f} mm off"
-    )
+    offset_m = max(float(np.linalg.norm((part.min(axis=0) + part.max(axis=0)) / 2)) for part in aligned_m)
+    sizes = f"boxes {ratio.min():.2f} to {ratio.max():.2f} of the mesh"
+    return f"{sizes}, whose middle is {1000 * offset_m:.1f} mm off"
 
 
 def _object_motion(
@@ -349,19 +327,11 @@ def _object_motion(
     source = np.clip(np.searchsorted(frames, np.arange(len(tracked)), side="right") - 1, 0, None)
     rotvec, position = rotmat_to_rotvec(world_from_object[:, :3, :3])[source], world_from_object[source, :3, 3]
     angle = None if hinge_rad is None else upsample_values(hinge_rad[source], tracked).astype(np.float32)
-    track = ObjectTrack(
-        model,
-        rotvec=upsample_rotvecs(rotvec).astype(np.float32),
-        translation_m=upsample_values(position, tracked).astype(np.float32),
-        hinge_rad=angle,
-    )
-    has_pose_or_neighbours = np.zeros(track.n_frames, bool)
-    has_pose_or_neighbours[::2], has_pose_or_neighbours[1::2] = tracked, tracked[:-1] & tracked[1:]
-    recorded = np.zeros(track.n_frames, bool)
-    recorded[::2] = tracked
-    return _ObjectMotion(
-        bridge(track, has_pose_or_neighbours), has_pose_or_neighbours, recorded, note, rejected_frames=rejected_frames
-    )
+    position = upsample_values(position, tracked).astype(np.float32)
+    track = ObjectTrack(model, upsample_rotvecs(rotvec).astype(np.float32), position, angle)
+    usable, recorded = np.zeros(track.n_frames, bool), np.zeros(track.n_frames, bool)
+    usable[::2], usable[1::2], recorded[::2] = tracked, tracked[:-1] & tracked[1:], tracked
+    return _ObjectMotion(bridge(track, usable), usable, recorded, note, rejected_frames=rejected_frames)
 
 
 def _hands(
@@ -415,9 +385,8 @@ def _gravity(
 ) -> tuple[np.ndarray | None, str]:
     """Estimate gravity from the base of the object at rest, because the source does not state it."""
     track = object_motion.track
-    joints = [np.where(t.valid[:, None, None], track_joints(t, hands[side]), np.nan) for side, t in tracks.items()]
     poses = np.tile(np.eye(4), (track.n_frames, 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = track.world_from_object.rotation, track.translation_m
     camera_rotation = np.repeat(camera[:, :3, :3], 2, axis=0)[: track.n_frames]
     base = TrackedObject(footing(track.model.vertices_m, track.model.faces_of(0)), object_motion.tracked, poses)
-    return estimate_gravity([base], np.concatenate(joints, axis=1).astype(np.float64), camera_rotation)
+    return estimate_gravity([base], hand_joints_m(tracks, hands), camera_rotation)

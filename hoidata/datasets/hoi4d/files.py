@@ -44,9 +44,8 @@ def match_boxes(
         raise BadInput(location, f"boxes of the size of {', '.join(names)}", got, remedy)
     if len(assignments) > 1 and assignments[1][0] < MIN_AMBIGUITY_RATIO * max(assignments[0][0], np.log1p(0.02)):
         got = f"parts of nearly the same size: {assignments[0][0]:.1%} and {assignments[1][0]:.1%} off"
-        raise BadInput(
-            location, "parts that their sizes tell apart", got, "nothing to do: which is which cannot be told"
-        )
+        remedy = "nothing to do: which is which cannot be told"
+        raise BadInput(location, "parts that their sizes tell apart", got, remedy)
     chosen = list(assignments[0][1])
     return chosen, tracked_m[chosen] / meshes_m
 
@@ -58,9 +57,8 @@ def aligned_from_whole(path: str, aligned_m: np.ndarray, whole_m: np.ndarray) ->
     transform = rigid_fit(whole_m[None], aligned_m[None])[0]
     max_error_m = float(np.abs(whole_m @ transform[:3, :3].T + transform[:3, 3] - aligned_m).max())
     if max_error_m > 1e-4 * max(1.0, float(np.ptp(whole_m))):
-        raise BadInput(
-            path, "the same mesh, turned and moved", f"one {max_error_m:.3g} m off", "download the models again"
-        )
+        got = f"one {max_error_m:.3g} m off"
+        raise BadInput(path, "the same mesh, turned and moved", got, "download the models again")
     return transform
 
 
@@ -121,42 +119,23 @@ class Category(NamedTuple):
 
 
 CATEGORIES = {
-    "C1": Category("ToyCar", "toy car", False),
-    "C2": Category("Mug", "mug", False),
-    "C3": Category("Laptop", "laptop", True),
-    "C4": Category("StorageFurniture", "storage cabinet", True),
-    "C5": Category("Bottle", "bottle", False),
-    "C6": Category("Safe", "safe", True),
-    "C7": Category("Bowl", "bowl", False),
-    "C8": Category("Bucket", "bucket", True),
-    "C9": Category("Scissors", "scissors", True),
-    "C11": Category("Pliers", "pliers", True),
-    "C12": Category("Kettle", "kettle", False),
-    "C13": Category("Knife", "knife", False),
-    "C14": Category("TrashCan", "trash can", True),
-    "C17": Category("Lamp", "lamp", True),
-    "C18": Category("Stapler", "stapler", True),
-    "C20": Category("Chair", "chair", False),
-}
+    "C1": Category("ToyCar", "toy car", False), "C2": Category("Mug", "mug", False),
+    "C3": Category("Laptop", "laptop", True), "C4": Category("StorageFurniture", "storage cabinet", True),
+    "C5": Category("Bottle", "bottle", False), "C6": Category("Safe", "safe", True),
+    "C7": Category("Bowl", "bowl", False), "C8": Category("Bucket", "bucket", True),
+    "C9": Category("Scissors", "scissors", True), "C11": Category("Pliers", "pliers", True),
+    "C12": Category("Kettle", "kettle", False), "C13": Category("Knife", "knife", False),
+    "C14": Category("TrashCan", "trash can", True), "C17": Category("Lamp", "lamp", True),
+    "C18": Category("Stapler", "stapler", True), "C20": Category("Chair", "chair", False),
+}  # fmt: skip
 # Verb and hand by event of color.json in lower case; None if the event does not act on the object.
 EVENTS: dict[str, tuple[str, HandType | None] | None] = {
-    **dict.fromkeys(("rest", "reachout", "stop", "go", "lookaround")),
-    "grasp": ("grasp", None),
-    "pickup": ("pick up", None),
-    "putdown": ("put down", None),
-    "carry": ("carry", None),
-    "carrywithbothhands": ("carry", "both"),
-    "open": ("open", None),
-    "close": ("close", None),
-    "push": ("push", None),
-    "pull": ("pull", None),
-    "press": ("press", None),
-    "turn&on&the&switch": ("turn on", None),
-    "cut": ("cut", None),
-    "paper-cut": ("cut", None),
-    "binding": ("bind", None),
-    "dump": ("dump", None),
-}
+    **dict.fromkeys(("rest", "reachout", "stop", "go", "lookaround")), "grasp": ("grasp", None),
+    "pickup": ("pick up", None), "putdown": ("put down", None), "carry": ("carry", None),
+    "carrywithbothhands": ("carry", "both"), "open": ("open", None), "close": ("close", None), "push": ("push", None),
+    "pull": ("pull", None), "press": ("press", None), "turn&on&the&switch": ("turn on", None), "cut": ("cut", None),
+    "paper-cut": ("cut", None), "binding": ("bind", None), "dump": ("dump", None),
+}  # fmt: skip
 # Verbs of whole recordings by category and task. A recording of another task has no verb.
 TASKS = {("C6", "T1"): "open and close", ("C9", "T2"): "cut", ("C11", "T4"): "clamp"}
 
@@ -245,10 +224,14 @@ def _part_pose(location: str, entry: Any) -> PartPose:
     return PartPose(label, centre, extents, Rotation.from_euler("XYZ", angles).as_matrix())  # Rx Ry Rz
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def _numbers(location: str, entry: Any, name: str, keys: tuple[str, ...]) -> np.ndarray:
     values = checks.entry(location, entry, name)
     numbers = [checks.entry(f"{location}.{name}", values, key) for key in keys]
-    if any(isinstance(value, bool) or not isinstance(value, int | float) for value in numbers):
+    if not all(map(_is_number, numbers)):
         raise BadInput(f"{location}.{name}", "numbers", repr(numbers)[:40])
     return checks.table(f"{location}.{name}", [numbers], len(keys))[0]
 
@@ -275,7 +258,7 @@ def action_events(data: bytes, path: str) -> list[Event]:
 
 def _times(location: str, item: Any, names: tuple[str, ...]) -> np.ndarray:
     numbers = [checks.entry(location, item, name) for name in names]
-    if any(isinstance(value, bool) or not isinstance(value, int | float) for value in numbers):
+    if not all(map(_is_number, numbers)):
         raise BadInput(location, "times in seconds", repr(numbers)[:40])
     times = checks.table(location, [numbers], len(names))[0]
     if not 0 <= times[0] <= times[1] <= 2 * CLOCKS_S[1]:
@@ -290,7 +273,7 @@ def _clock_s(path: str, value: Mapping[str, Any], last_s: float) -> float:
     if not stated:
         return CLOCKS_S[0] if last_s <= 1.05 * CLOCKS_S[0] else CLOCKS_S[1]
     length = stated[0]
-    if isinstance(length, bool) or not isinstance(length, int | float) or not 1 <= length <= 100:
+    if not _is_number(length) or not 1 <= length <= 100:
         raise BadInput(f"{path}: duration", "seconds, 1 to 100", repr(length)[:40])
     return min(CLOCKS_S, key=lambda clock: abs(clock - length))
 
@@ -300,10 +283,8 @@ def camera_poses(data: bytes, path: str) -> np.ndarray:
     lines = [line.split() for line in data.decode("utf-8", "replace").splitlines() if line.strip()]
     if not lines or len(lines) % 5:
         raise BadInput(path, "five lines per frame", f"{len(lines)} lines")
-    if any(len(line) != 3 for line in lines[::5]):
-        raise BadInput(
-            path, "three numbers above each matrix", " ".join(next(r for r in lines[::5] if len(r) != 3))[:40]
-        )
+    if wrong := next((line for line in lines[::5] if len(line) != 3), None):
+        raise BadInput(path, "three numbers above each matrix", " ".join(wrong)[:40])
     try:
         rows = [[float(word) for word in line] for number, line in enumerate(lines) if number % 5]
     except ValueError as error:
@@ -341,9 +322,8 @@ def hinge_joint(mobility: bytes, tree: bytes, path: str, tree_path: str) -> Join
         raise BadInput(path, "one base and one part that turns", ", ".join(kinds) or "none", remedy)
     meshes = _meshes_by_id(checks.json_value(tree_path, tree), tree_path)
     axis = checks.entry(path, checks.entry(path, moving[0], "jointData"), "axis")
-    origin, direction = (
-        checks.table(f"{path}: {name}", [checks.entry(path, axis, name)], 3)[0] for name in ("origin", "direction")
-    )
+    names = ("origin", "direction")
+    origin, direction = (checks.table(f"{path}: {name}", [checks.entry(path, axis, name)], 3)[0] for name in names)
     length = float(np.linalg.norm(direction))
     if not 1e-6 < length < 1e6:
         raise BadInput(f"{path}: direction", "a direction", str(direction.tolist()))

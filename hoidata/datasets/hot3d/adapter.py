@@ -27,13 +27,14 @@ from hoidata.datasets.gaps import (
     missing_poses,
     trim_to_recorded,
 )
+from hoidata.datasets.gravity import hand_joints_m
 from hoidata.datasets.hinge import box_corners
 from hoidata.datasets.hot3d.files import PARTS, HandFormat, Poses, Profile, Source, joints_m, object_words, read_source
 from hoidata.datasets.segments import segment_clips
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import Interval, bridged, runs, split_evenly, widened
 from hoidata.geometry.rotations import rotmat_to_rotvec
-from hoidata.hands import HandPair, track_joints
+from hoidata.hands import HandPair
 from hoidata.hands.fitting import fit_hands, fit_shape
 from hoidata.objects.distance import closest_points
 from hoidata.objects.model import ObjectModel
@@ -47,21 +48,19 @@ WORLD_FROM = {"Aria": np.eye(3), "Quest3": np.array([[1.0, 0, 0], [0, 0, -1], [0
 LOWER_SHORTEST_FRAMES = "nothing to do, or lower the setting shortest_frames"
 GRAVITY = np.array([0.0, 0.0, -1.0])
 FRAME = WorldFrame("+z", "stated", "the headset's world, metres, z up; Quest 3's, y up, is turned about x")
+PARAMETERS_NOTE = (
+    "MANO: 15 principal components relative to the mean pose, left shape directions corrected, translation added"
+)
 PARAMETERS = HandConvention(
     translation="transl",
     fingers="mean-relative",
     shape="betas per sequence",
     left_shape="corrected",
     components=15,
-    note="MANO: 15 principal components relative to the mean pose, left shape directions corrected, translation added",
+    note=PARAMETERS_NOTE,
 )
-FITTED = HandConvention(
-    translation="wrist",
-    fingers="absolute",
-    shape="fitted",
-    left_shape="unused",
-    note="UmeTrack: a MANO-layout hand was fitted to 20 joints and tips, one shape per recording",
-)
+FITTED_NOTE = "UmeTrack: a MANO-layout hand was fitted to 20 joints and tips, one shape per recording"
+FITTED = HandConvention(translation="wrist", fingers="absolute", shape="fitted", left_shape="unused", note=FITTED_NOTE)
 
 
 class _Hands(NamedTuple):
@@ -170,18 +169,11 @@ class Hot3dAdapter(AdapterBase):
     def _cut(self, whole: Clip, recording: _Recording, hands: HandPair) -> Iterator[Clip | Quarantined]:
         if recording.failed.any():
             yield _rejected(whole, "failed", "frames that passed the makers' check", runs(recording.failed))
-        side_joints_m = [
-            np.where(t.valid[:, None, None], track_joints(t, hands[s]), np.nan) for s, t in whole.hands.items()
-        ]
-        joints_m = np.concatenate(side_joints_m, axis=1).astype(np.float64)
-        for recorded_object in recording.objects:
-            name = recorded_object.track.model.name
-            intervals = self._intervals(
-                recorded_object, recorded_object.has_pose & ~recording.failed, recording.times_ns, joints_m
-            )
-            yield from missing_poses(
-                f"{whole.clip_id}/{name}/missing", whole.sequence, name, whole.source_frames, recorded_object.tracked
-            )
+        joints_m = hand_joints_m(whole.hands, hands)
+        for item in recording.objects:
+            name, missing_key = item.track.model.name, f"{whole.clip_id}/{item.track.model.name}/missing"
+            intervals = self._intervals(item, item.has_pose & ~recording.failed, recording.times_ns, joints_m)
+            yield from missing_poses(missing_key, whole.sequence, name, whole.source_frames, item.tracked)
             if intervals.cut:
                 expected = f"touches of {self.shortest_frames} frames between missing poses of the object or a hand"
                 yield _rejected(whole, f"{name}/cut", expected, intervals.cut, LOWER_SHORTEST_FRAMES)
@@ -191,7 +183,7 @@ class Hot3dAdapter(AdapterBase):
             if intervals.still:
                 yield _rejected(whole, f"{name}/still", f"an object that moves {100 * MOVED_M:g} cm", intervals.still)
             for interval in intervals.clips:
-                yield self._clip(whole, interval, recorded_object, recording)
+                yield self._clip(whole, interval, item, recording)
 
     def _clip(
         self, whole: Clip, interval: Interval, recorded_object: _RecordedObject, recording: _Recording
@@ -200,14 +192,10 @@ class Hot3dAdapter(AdapterBase):
         others = [other for other in recording.objects if other is not recorded_object and other.has_poses_in(frames)]
         clip_id = f"{whole.clip_id}/{interval.start:05d}-{interval.stop - 1:05d}-{name}"
         recorded = np.logical_and.reduce([item.tracked[frames] for item in (recorded_object, *others)])
-        whole_with_object = replace(
-            whole, clip_id=clip_id, object=recorded_object.track, other_objects=tuple(other.track for other in others)
-        )
-        clip = replace(
-            whole_with_object.take(frames),
-            object_words=object_words(name),
-            source_frames=mark_interpolated(whole.source_frames[frames], recorded),
-        )
+        tracks = {"object": recorded_object.track, "other_objects": tuple(other.track for other in others)}
+        source_frames = mark_interpolated(whole.source_frames[frames], recorded)
+        clip = replace(whole, clip_id=clip_id, object_words=object_words(name), **tracks).take(frames)
+        clip = replace(clip, source_frames=source_frames)
         if error_m is None:
             return clip
         mean_m = float(np.nanmean(error_m[frames]))
@@ -242,16 +230,14 @@ class Hot3dAdapter(AdapterBase):
 
 def _recording(raw: RawTree, source: Source, hands: HandPair) -> _Recording:
     world = WORLD_FROM[source.headset]
-    times = frame_times(
-        source.path, [poses.time_ns for poses in (*source.poses.values(), *source.object_poses.values())]
-    )
+    all_poses = (*source.poses.values(), *source.object_poses.values())
+    times = frame_times(source.path, [poses.time_ns for poses in all_poses])
     if source.profile is None:
         hand_tracks = _parameter_hands(source.poses, times, hands, world)
     else:
         hand_tracks = _fitted_hands(source.profile, source.poses, times, hands, world)
-    objects = [
-        _recorded_object(raw, *source.models[key], poses, times, world) for key, poses in source.object_poses.items()
-    ]
+    models_and_poses = [(source.models[key], poses) for key, poses in source.object_poses.items()]
+    objects = [_recorded_object(raw, *model, poses, times, world) for model, poses in models_and_poses]
     return _Recording(source, times, rows_of_frames(times, source.failed_ns) >= 0, hand_tracks, objects=objects)
 
 
@@ -304,11 +290,10 @@ def _fitted_hands(
     profile: Profile, poses: dict[Side, Poses], times: np.ndarray, hands: HandPair, world: np.ndarray
 ) -> _Hands:
     """Fit a MANO-layout hand to UmeTrack's joints: one shape per recording, each run of valid frames separately."""
-    points: dict[Side, np.ndarray] = {
-        side: joints_m(profile, side_poses, side) @ world.T for side, side_poses in poses.items()
-    }
+    points, tracks = dict[Side, np.ndarray](), dict[Side, HandTrack]()
+    for side, side_poses in poses.items():
+        points[side] = joints_m(profile, side_poses, side) @ world.T
     betas = fit_shape(points, hands)
-    tracks: dict[Side, HandTrack] = {}
     errors = np.full((len(SIDES), len(times)), np.nan)
     for side_index, side in enumerate(SIDES):
         rows, valid = _rows(poses.get(side), times)

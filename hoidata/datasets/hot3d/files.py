@@ -29,29 +29,15 @@ from hoidata.geometry.transform import RigidTransform
 
 # Object names of instance.json that differ from plain words.
 NOUNS = {
-    "aria_small": "smart glasses",
-    "birdhouse_toy": "toy birdhouse",
-    "bottle_bbq": "barbecue sauce bottle",
-    "bottle_mustard": "mustard bottle",
-    "bottle_ranch": "ranch dressing bottle",
-    "can_parmesan": "parmesan can",
-    "can_soup": "soup can",
-    "can_tomato_sauce": "tomato sauce can",
-    "carton_milk": "milk carton",
-    "carton_oj": "orange juice carton",
-    "dino_toy": "toy dinosaur",
-    "dumbbell_5lb": "dumbbell",
-    "dvd_remote": "remote control",
-    "food_vegetables": "toy vegetables",
-    "food_waffles": "toy waffles",
-    "holder_black": "black holder",
-    "holder_gray": "gray holder",
-    "mug_patterned": "patterned mug",
-    "mug_white": "white mug",
-    "plate_bamboo": "bamboo plate",
-    "spatula_red": "red spatula",
+    "aria_small": "smart glasses", "birdhouse_toy": "toy birdhouse", "bottle_bbq": "barbecue sauce bottle",
+    "bottle_mustard": "mustard bottle", "bottle_ranch": "ranch dressing bottle", "can_parmesan": "parmesan can",
+    "can_soup": "soup can", "can_tomato_sauce": "tomato sauce can", "carton_milk": "milk carton",
+    "carton_oj": "orange juice carton", "dino_toy": "toy dinosaur", "dumbbell_5lb": "dumbbell",
+    "dvd_remote": "remote control", "food_vegetables": "toy vegetables", "food_waffles": "toy waffles",
+    "holder_black": "black holder", "holder_gray": "gray holder", "mug_patterned": "patterned mug",
+    "mug_white": "white mug", "plate_bamboo": "bamboo plate", "spatula_red": "red spatula",
     "spoon_wooden": "wooden spoon",
-}
+}  # fmt: skip
 
 
 def object_words(name: str) -> str:
@@ -61,10 +47,8 @@ def object_words(name: str) -> str:
 
 HandFormat = Literal["mano", "umetrack"]
 # Numbers of one hand in addition to its pose. UmeTrack also has two angles of the wrist, which are zero and unused.
-HAND_COLUMNS: Mapping[HandFormat, Mapping[str, int]] = {
-    "mano": {"pose": 15, "betas": 10},
-    "umetrack": {"joint_angles": 22},
-}
+HAND_COLUMNS: Mapping[HandFormat, Mapping[str, int]]
+HAND_COLUMNS = {"mano": {"pose": 15, "betas": 10}, "umetrack": {"joint_angles": 22}}
 WRIST = {"t_xyz": 3, "q_wxyz": 4}
 SIDE_OF_KEY: Mapping[str, Side] = {"0": "left", "1": "right"}
 POSE_COLUMNS = ("object_uid", "timestamp[ns]", *(f"t_wo_{axis}[m]" for axis in "xyz"), *(f"q_wo_{i}" for i in "wxyz"))
@@ -101,11 +85,9 @@ def hand_poses(data: bytes, path: str, kind: HandFormat) -> dict[Side, Poses]:
         for key, hand in hands.items():
             hand_location = f"{location}: hand {key}"
             wrist = checks.entry(hand_location, hand, "wrist_xform")
-            values = [
-                list_of_numbers(hand_location, wrist if name in WRIST else hand, name, count)
-                for name, count in columns.items()
-            ]
-            rows[SIDE_OF_KEY[key]].append((time_ns, list(chain.from_iterable(values))))
+            holders = [(wrist if name in WRIST else hand, name, count) for name, count in columns.items()]
+            values = chain.from_iterable(list_of_numbers(hand_location, *holder) for holder in holders)
+            rows[SIDE_OF_KEY[key]].append((time_ns, list(values)))
     return {side: poses_of(f"{path}: {side} hand", rows[side], columns) for side in SIDES if rows[side]}
 
 
@@ -244,17 +226,10 @@ HANDS: Mapping[HandFormat, str] = {kind: f"{kind}_hand_pose_trajectory.jsonl" fo
 ASSETS, CHECKED = "assets", "masks/mask_qa_pass.csv"
 DEFINITIONS, MODEL_FOLDERS = "clip_definitions.json", ("object_models_eval", "object_models")
 WITHHELD = "nothing to do: of some participants the makers withhold the ground truth"
+_DOWNLOADS = "Aria and Quest downloads, or HOT3D-Clips"
 PARTS = (
-    DatasetPart(
-        "hand motion",
-        (*(f"P*/{name}" for name in HANDS.values()), "*_*/clip-*.tar"),
-        "Aria and Quest downloads, or HOT3D-Clips",
-    ),
-    DatasetPart(
-        "object motion and headset",
-        (f"P*/{OBJECTS}", f"P*/{METADATA}", DEFINITIONS),
-        "Aria and Quest downloads, or HOT3D-Clips",
-    ),
+    DatasetPart("hand motion", (*(f"P*/{name}" for name in HANDS.values()), "*_*/clip-*.tar"), _DOWNLOADS),
+    DatasetPart("object motion and headset", (f"P*/{OBJECTS}", f"P*/{METADATA}", DEFINITIONS), _DOWNLOADS),
     DatasetPart(
         "object meshes and names",
         (f"{ASSETS}/*.glb", f"{ASSETS}/instance.json", *(f"{folder}/obj_*.glb" for folder in MODEL_FOLDERS)),
@@ -319,8 +294,8 @@ def _folder(raw: RawTree, key: SequenceKey, hand_format: HandFormat) -> Source:
 
 def _packed(raw: RawTree, key: SequenceKey, hand_format: HandFormat) -> Source:
     """Read one clip of HOT3D-Clips. ``clip_definitions.json`` names its recording."""
-    path, number = f"{key.name}.tar", int(key.name.rpartition("-")[2])
-    recording, device = clip_definition(raw.read(DEFINITIONS, MAX_JSON_BYTES), DEFINITIONS, number)
+    path, clip_number = f"{key.name}.tar", int(key.name.rpartition("-")[2])
+    recording, device = clip_definition(raw.read(DEFINITIONS, MAX_JSON_BYTES), DEFINITIONS, clip_number)
     packed = read_packed(raw.read(path), path)
     kinds: list[HandFormat] = [kind for kind in _formats(hand_format) if packed.hands[kind]]
     if not kinds:
@@ -333,14 +308,10 @@ def _packed(raw: RawTree, key: SequenceKey, hand_format: HandFormat) -> Source:
     else:
         betas = small_table(f"{path}/{SHAPES}: mano", [shape], 10, 1)
         for side, side_poses in poses.items():
-            poses[side] = side_poses._replace(
-                numbers={**side_poses.numbers, "betas": np.repeat(betas, len(side_poses.time_ns), axis=0)}
-            )
+            betas_of_rows = np.repeat(betas, len(side_poses.time_ns), axis=0)
+            poses[side] = side_poses._replace(numbers={**side_poses.numbers, "betas": betas_of_rows})
     folder = next((folder for folder in MODEL_FOLDERS if raw.names(folder, ".glb")), MODEL_FOLDERS[0])
-    models = {
-        object_number: (name, f"{folder}/obj_{int(object_number):06d}.glb")
-        for object_number, name in packed.names.items()
-    }
+    models = {number: (name, f"{folder}/obj_{int(number):06d}.glb") for number, name in packed.names.items()}
     return Source(
         path=path,
         subject=recording.partition("_")[0],
@@ -401,18 +372,13 @@ def read_packed(data: bytes, path: str) -> Packed:
             _add_objects(location, value, time_ns, objects, names)
     if not objects:
         raise BadInput(path, "poses of hands and objects", "none", "nothing to do: of test clips they are withheld")
-    columns: dict[HandFormat, dict[str, int]] = {
-        "mano": {**WRIST, "pose": 15},
-        "umetrack": {**WRIST, "joint_angles": 20},
-    }
+    columns = {"mano": {**WRIST, "pose": 15}, "umetrack": {**WRIST, "joint_angles": 20}}
     poses: dict[HandFormat, dict[Side, Poses]] = {
         kind: {side: poses_of(f"{path}: {side} hand", rows, columns[kind]) for side, rows in rows_by_side.items()}
         for kind, rows_by_side in hands.items()
     }
-    object_rows = sorted(objects.items())
-    return Packed(
-        poses, {key: poses_of(f"{path}: object {key}", rows, WRIST) for key, rows in object_rows}, names, shapes
-    )
+    object_poses = {key: poses_of(f"{path}: object {key}", rows, WRIST) for key, rows in sorted(objects.items())}
+    return Packed(poses, object_poses, names, shapes)
 
 
 def _members(data: bytes, path: str) -> Iterator[tuple[str, bytes]]:
@@ -436,19 +402,15 @@ def _add_hands(path: str, value: Any, time_ns: int, hands: Mapping[HandFormat, R
             continue
         location = f"{path}: {side}"
         if isinstance(hand, dict) and "mano_pose" in hand:
-            orient_and_position = list_of_numbers(
-                f"{location}.mano_pose", hand["mano_pose"], "wrist_xform", WRIST_NUMBERS
-            )
-            quaternion_wxyz = np.roll(
-                Rotation.from_rotvec(np.clip(orient_and_position[:3], -100, 100)).as_quat(), 1
-            ).tolist()
-            pose = list_of_numbers(f"{location}.mano_pose", hand["mano_pose"], "thetas", 15)
-            hands["mano"].setdefault(side, []).append((time_ns, [*orient_and_position[3:], *quaternion_wxyz, *pose]))
-        umetrack_pose = checks.entry(location, hand, "umetrack_pose")
-        angles = list_of_numbers(f"{location}.umetrack_pose", umetrack_pose, "joint_angles", 20)
-        wrist = _translation_and_quaternion(
-            f"{location}.umetrack_pose", checks.entry(location, umetrack_pose, "T_world_from_wrist")
-        )
+            mano_pose, mano_location = hand["mano_pose"], f"{location}.mano_pose"
+            wrist = list_of_numbers(mano_location, mano_pose, "wrist_xform", WRIST_NUMBERS)
+            xyzw = Rotation.from_rotvec(np.clip(wrist[:3], -100, 100)).as_quat()
+            pose = list_of_numbers(mano_location, mano_pose, "thetas", 15)
+            hands["mano"].setdefault(side, []).append((time_ns, [*wrist[3:], *np.roll(xyzw, 1).tolist(), *pose]))
+        umetrack_pose, umetrack_location = checks.entry(location, hand, "umetrack_pose"), f"{location}.umetrack_pose"
+        angles = list_of_numbers(umetrack_location, umetrack_pose, "joint_angles", 20)
+        wrist_pose = checks.entry(location, umetrack_pose, "T_world_from_wrist")
+        wrist = _translation_and_quaternion(umetrack_location, wrist_pose)
         hands["umetrack"].setdefault(side, []).append((time_ns, [*wrist, *angles]))
 
 
@@ -458,18 +420,14 @@ def _add_objects(path: str, value: Any, time_ns: int, objects: Rows, names: dict
     for key, entries in value.items():
         if not re.fullmatch(r"[0-9]{1,6}", key) or not isinstance(entries, list) or len(entries) != 1:
             raise BadInput(f"{path}: {key}", "a number, and one object in a list", repr(entries)[:40])
-        pose = _translation_and_quaternion(
-            f"{path}: {key}", checks.entry(f"{path}: {key}", entries[0], "T_world_from_object")
-        )
-        objects.setdefault(key, []).append((time_ns, pose))
+        pose = checks.entry(f"{path}: {key}", entries[0], "T_world_from_object")
+        objects.setdefault(key, []).append((time_ns, _translation_and_quaternion(f"{path}: {key}", pose)))
         names[key] = checked_name(f"{path}: {key}", checks.entry(f"{path}: {key}", entries[0], "object_name"))
 
 
 def _translation_and_quaternion(location: str, value: Any) -> list:
-    return [
-        *list_of_numbers(location, value, "translation_xyz", 3),
-        *list_of_numbers(location, value, "quaternion_wxyz", 4),
-    ]
+    columns = {"translation_xyz": 3, "quaternion_wxyz": 4}
+    return [number for name, count in columns.items() for number in list_of_numbers(location, value, name, count)]
 
 
 N_DIGITS, HINGES = 5, 4
@@ -501,17 +459,15 @@ def profile_of(hand: Any, location: str) -> Profile:
     def rows(name: str, count: int) -> np.ndarray:
         return small_table(f"{location}: {name}", checks.entry(location, hand, name), 3, count)
 
-    axes, hinge_points = (
-        rows(f"joint_{name}", N_ANGLES + 2)[:N_ANGLES] for name in ("rotation_axes", "rest_positions")
-    )
+    names = ("joint_rotation_axes", "joint_rest_positions")
+    axes, hinge_points = (rows(name, N_ANGLES + 2)[:N_ANGLES] for name in names)
     if (np.abs(np.linalg.norm(axes, axis=1) - 1) > 1e-3).any():
         raise BadInput(f"{location}: joint_rotation_axes", "axes of length 1", "another length")
     landmarks = rows("landmark_rest_positions", len(LANDMARKS))
     bones, weights = (rows(f"landmark_rest_bone_{name}", len(LANDMARKS)) for name in ("indices", "weights"))
     if not np.isin(bones, range(N_BONES)).all() or (np.abs(weights.sum(axis=1) - 1) > 1e-3).any():
-        raise BadInput(
-            f"{location}: landmark_rest_bone_*", f"bones 0 to {N_BONES - 1}, weights that sum to 1", "others"
-        )
+        expected = f"bones 0 to {N_BONES - 1}, weights that sum to 1"
+        raise BadInput(f"{location}: landmark_rest_bone_*", expected, "others")
     skin = np.zeros((len(LANDMARKS), N_BONES))
     np.add.at(skin, (np.arange(len(LANDMARKS))[:, None], bones.astype(int)), weights)
     return Profile(axes, hinge_points * MILLIMETRES, landmarks * MILLIMETRES, skin)

@@ -55,26 +55,17 @@ from hoidata.objects.model import ObjectModel
 MESH_FOLDERS = ("objects/Primitive", "objects/Dining", "objects/recovered")
 THUMB_CHAIN = ("THUMB_CMC_FE", "THUMB_CMC_AA", "THUMB_MCP_FE", "THUMB_IP_FE")
 FINGERS = ("INDEX", "MIDDLE", "PINKY", "RING")  # in MANO's order; the files have ring before pinky
-HAND_JOINTS = (
-    "WRIST",
-    *THUMB_CHAIN,
-    *(f"{finger}_{joint}" for finger in ("INDEX", "MIDDLE", "RING", "PINKY") for joint in ("MCP", "PIP_FE", "DIP_FE")),
-)
+_JOINTS_OF = {finger: tuple(f"{finger}_{joint}" for joint in ("MCP", "PIP_FE", "DIP_FE")) for finger in FINGERS}
+_INDEX, _MIDDLE, _PINKY, _RING = _JOINTS_OF.values()
+HAND_JOINTS = ("WRIST", *THUMB_CHAIN, *_INDEX, *_MIDDLE, *_RING, *_PINKY)
 # Source joint of each of MANO's 16 joints; THUMB_CMC_FE has no counterpart.
-MANO_JOINTS = (
-    "WRIST",
-    *(f"{finger}_{joint}" for finger in FINGERS for joint in ("MCP", "PIP_FE", "DIP_FE")),
-    *THUMB_CHAIN[1:],
-)
+MANO_JOINTS = ("WRIST", *_INDEX, *_MIDDLE, *_PINKY, *_RING, *THUMB_CHAIN[1:])
 TIP_JOINTS = (*(f"{finger}_DIP_FE" for finger in FINGERS), "THUMB_IP_FE")
 GRAVITY = np.array([0.0, -1.0, 0.0])
 FRAME = WorldFrame("+y", "stated", "Unity's world seen in a mirror with normal x: right-handed, y up")
+HAND_NOTE = "17-joint skeletons: a MANO-layout hand was fitted to joints and tips, one shape per recording"
 CONVENTION = HandConvention(
-    translation="wrist",
-    fingers="absolute",
-    shape="fitted",
-    left_shape="unused",
-    note="17-joint skeletons: a MANO-layout hand was fitted to joints and tips, one shape per recording",
+    translation="wrist", fingers="absolute", shape="fitted", left_shape="unused", note=HAND_NOTE
 )
 PARTS = (
     DatasetPart("object and hand motion", ("sequences/*/*.bvh.gz",), "the data release"),
@@ -115,10 +106,8 @@ class Recording:
 
     def distances_m(self) -> dict[Side, np.ndarray]:
         """Per side (frame, 21) distance of each recorded keypoint from the object's surface."""
-        return {
-            side: surface_distances(self.model, self.rotation, self.translation_m, points)
-            for side, points in self.keypoints_m.items()
-        }
+        pose = self.model, self.rotation, self.translation_m
+        return {side: surface_distances(*pose, points) for side, points in self.keypoints_m.items()}
 
 
 def surface_distances(
@@ -231,6 +220,7 @@ def read_recording(raw: RawTree, name: str) -> Recording:
     frames = thirty_fps_frames(object_motion.n_frames, object_motion.frame_time_s)
     tips = _read_tips(raw)
     positions, rotations = object_motion.at(frames).world_joints()
+    bodies = {"left hand": left, "right hand": motions["right"], "object": object_motion}
     return Recording(
         source_fps=round(1 / object_motion.frame_time_s, 3),
         source_frames=frames,
@@ -238,9 +228,7 @@ def read_recording(raw: RawTree, name: str) -> Recording:
         model=model,
         rotation=rotations[:, 0],
         translation_m=positions[:, 0] * METRES_PER_UNIT,
-        cuts=find_cuts(
-            _body("left hand", motions["left"]), _body("right hand", motions["right"]), _body("object", object_motion)
-        ),
+        cuts=find_cuts(*(_body(name, motion) for name, motion in bodies.items())),
         paths=(*hand_paths.values(), object_path, mesh_path, HAND_REFERENCE),
     )
 
@@ -252,7 +240,8 @@ def read_hand_recording(raw: RawTree, key: SequenceKey) -> HandRecording:
     usable = np.ones(object_motion.n_frames, dtype=bool)
     for cut in recording.cuts:
         usable[cut.start : cut.stop] = False
-    object_body = _body("object", object_motion)
+    body = _body("object", object_motion)
+    rotvec, position_m = rotmat_to_rotvec(body.rotation).astype(np.float32), body.position_m.astype(np.float32)
     return HandRecording(
         dataset=key.dataset,
         subject=key.subject,
@@ -260,11 +249,7 @@ def read_hand_recording(raw: RawTree, key: SequenceKey) -> HandRecording:
         fps=recording.source_fps,
         hand=read_hand(raw, right),
         hands={"left": _hand_track(left), "right": _hand_track(right)},
-        object=ObjectTrack(
-            recording.model,
-            rotmat_to_rotvec(object_body.rotation).astype(np.float32),
-            object_body.position_m.astype(np.float32),
-        ),
+        object=ObjectTrack(recording.model, rotvec, position_m),
         usable=usable,
         gravity=GRAVITY,
         sources=raw.recorded(*recording.paths, HAND_SKIN),
@@ -335,10 +320,8 @@ def _read_tips(raw: RawTree) -> dict[str, np.ndarray]:
 
 def _body(name: str, motion: BvhMotion) -> BodyMotion:
     """Position and rotation of a BVH file's root joint, and the values of all its channels."""
-    root = replace(
-        motion, names=motion.names[:1], parents=motion.parents[:1], angles_yxz_rad=motion.angles_yxz_rad[:, :1]
-    )
-    positions, rotations = root.world_joints()
+    first = {"names": motion.names[:1], "parents": motion.parents[:1], "angles_yxz_rad": motion.angles_yxz_rad[:, :1]}
+    positions, rotations = replace(motion, **first).world_joints()
     raw = np.concatenate((motion.root_position, motion.angles_yxz_rad.reshape(motion.n_frames, -1)), axis=1)
     return BodyMotion(name, positions[:, 0] * METRES_PER_UNIT, rotations[:, 0], raw)
 

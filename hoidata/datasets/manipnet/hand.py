@@ -50,14 +50,9 @@ class BvhMotion:
 
     def seen_in_mirror_x(self) -> "BvhMotion":
         """The motion with x of the world and of every joint negated, which changes handedness."""
-        axis_signs = np.array([-1.0, 1.0, 1.0])
-        angle_signs = np.array([-1.0, 1.0, -1.0])
-        return replace(
-            self,
-            offsets=self.offsets * axis_signs,
-            root_position=self.root_position * axis_signs,
-            angles_yxz_rad=self.angles_yxz_rad * angle_signs,
-        )
+        offsets, root_position = self.offsets * MIRROR_X, self.root_position * MIRROR_X
+        angles = self.angles_yxz_rad * np.array([-1.0, 1.0, -1.0])
+        return replace(self, offsets=offsets, root_position=root_position, angles_yxz_rad=angles)
 
     def world_joints(self) -> tuple[np.ndarray, np.ndarray]:
         """Positions (frame, joint, 3) in the file's unit and rotations ``world_from_joint`` (frame, joint, 3, 3)."""
@@ -220,18 +215,12 @@ THUMB_BASE = 1  # THUMB_CMC_FE, whose bone the skin does not know: that bone's p
 # ManipNet's limits about the neutral pose, degrees, by the end of the joint's name: its measured ranges widened by 10
 # below and 30 above (HandIK). Hinges turn about the local z axis of the files.
 LIMITS_DEG = {
-    "THUMB_MCP_FE": (-10.0, 103.8),
-    "THUMB_IP_FE": (-24.8, 92.3),
-    "PIP_FE": (-10.0, 137.9),
-    "DIP_FE": (-10.0, 112.1),
-}
+    "THUMB_MCP_FE": (-10.0, 103.8), "THUMB_IP_FE": (-24.8, 92.3), "PIP_FE": (-10.0, 137.9), "DIP_FE": (-10.0, 112.1),
+}  # fmt: skip
 _SHAPES = {
-    "vertices": (788, 3),
-    "normals": (788, 3),
-    "bone_indices": (788, 4),
-    "bone_weights": (788, 4),
+    "vertices": (788, 3), "normals": (788, 3), "bone_indices": (788, 4), "bone_weights": (788, 4),
     "bind_poses": (17, 4, 4),
-}
+}  # fmt: skip
 
 
 def read_hand(raw: RawTree, skeleton: BvhMotion) -> TrackedHand:
@@ -270,10 +259,8 @@ def _read_reference(raw: RawTree, names: tuple[str, ...]) -> tuple[JointCapsules
         reference = json.loads(raw.read(HAND_REFERENCE, LARGEST_REFERENCE))
         capsule_entries = reference["capsules"]
         joint = np.array([names.index(capsule["joint"]) for capsule in capsule_entries])
-        start, end = (
-            np.array([capsule[key] for capsule in capsule_entries], dtype=np.float64)
-            for key in ("start_local", "end_local")
-        )
+        ends = ("start_local", "end_local")
+        start, end = (np.array([entry[key] for entry in capsule_entries], dtype=np.float64) for key in ends)
         radius = np.array([capsule["radius"] for capsule in capsule_entries], dtype=np.float64)
         sensors = np.array(reference["proximity_vertices"], dtype=np.int64)
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:

@@ -16,12 +16,9 @@ from hoidata.geometry.rotations import rotation_angle
 
 SIZES = {"small": "small", "med": "medium", "large": "large"}
 NOUNS = {
-    "cyl": "cylinder",
-    "hemi": "hemisphere",
-    "tetra": "tetrahedron",
-    "tri prism": "triangular prism",
+    "cyl": "cylinder", "hemi": "hemisphere", "tetra": "tetrahedron", "tri prism": "triangular prism",
     "wineglass": "wine glass",
-}
+}  # fmt: skip
 
 
 def object_words(name: str) -> str:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack, Side, WorldFrame
+from hoidata.clips.clip import Clip, ObjectTrack, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, to_track
 from hoidata.dataset_folders import facts_of_adapter
 from hoidata.datasets.base import AdapterBase, DatasetPart, Quarantined, RawTree, SequenceKey
@@ -46,12 +46,11 @@ OBJECTS = ("object_repair", "object_raw", "object_preview")  # repaired, as scan
 TREE = "object_affordance/object_part_tree.json"
 FRAME = WorldFrame(None, "unknown", "the world of the motion capture, right-handed, metres, axes not documented")
 GRAVITY_NOTE = "OakInk2 does not say which way is up; converters of others take y for up"
+HAND_NOTE = (
+    "MANO: absolute quaternions w x y z, betas per frame, the translation is the wrist (manotorch, center_idx 0)"
+)
 CONVENTION = HandConvention(
-    translation="wrist",
-    fingers="absolute",
-    shape="betas per frame",
-    left_shape="as released",
-    note="MANO: absolute quaternions w x y z, betas per frame, the translation is the wrist (manotorch, center_idx 0)",
+    translation="wrist", fingers="absolute", shape="betas per frame", left_shape="as released", note=HAND_NOTE
 )
 PARTS = (
     DatasetPart("motion of hands and objects", tuple(f"{name}/*.pkl" for name in ANNOTATIONS), "anno_preview"),
@@ -115,19 +114,9 @@ class Oakink2Adapter(AdapterBase):
         program_path = f"{PROGRAM}/{token}.json"
         has_program = has_description(self.clips, raw, program_path)
         names, roots = object_names(raw)
-        scene = Scene(
-            raw=raw,
-            key=str(key),
-            path=path,
-            annotation=annotation,
-            names=names,
-            roots=roots,
-            most_off_mm=self.most_off_mm,
-            most_off_deg=self.most_off_deg,
-        )
-        tracks: dict[Side, HandTrack] = {
-            side: to_track(annotation.hands[side], CONVENTION, hands[side]) for side in SIDES
-        }
+        limits = self.most_off_mm, self.most_off_deg
+        scene = Scene(raw, str(key), path, annotation, names=names, roots=roots, limits=limits)
+        tracks = {side: to_track(hand, CONVENTION, hands[side]) for side, hand in annotation.hands.items()}
         results = list[Clip | Quarantined]()
         if has_program:
             program = read_program(raw.read(program_path, MAX_JSON_BYTES), program_path)
@@ -151,9 +140,7 @@ class Oakink2Adapter(AdapterBase):
                 object_words=str(objects[0].words),
                 labelled_hand=segment.hand,
                 other_objects=tuple(other.track for other in objects[1:]),
-                gravity_note="; ".join(
-                    [GRAVITY_NOTE, *(scene_object.note for scene_object in objects if scene_object.note)]
-                ),
+                gravity_note="; ".join([GRAVITY_NOTE, *(item.note for item in objects if item.note)]),
             )
             clips = self._cut(whole, described_in, segment.span, objects)
             results += clips if has_program or self.clips == "whole" else segment_clips(clips, hands)
@@ -166,9 +153,8 @@ class Oakink2Adapter(AdapterBase):
         """One clip per interval of a primitive in which all its objects have poses. span: frames at 120 Hz."""
         frames, margin = whole.source_frames, self.margin_frames * STEP
         inside = (frames >= span[0] - margin) & (frames < span[1] + margin)
-        all_have_pose, recorded = (
-            np.logical_and.reduce([frames_of(item.tracked) for item in objects]) for frames_of in (has_pose, np.asarray)
-        )
+        all_have_pose = np.logical_and.reduce([has_pose(item.tracked) for item in objects])
+        recorded = np.logical_and.reduce([item.tracked for item in objects])
         intervals = [trim_to_recorded(piece, recorded) for piece in runs(inside & all_have_pose)]
         for scene_object in objects:
             name, tracked = scene_object.track.model.name, scene_object.tracked[inside]
@@ -220,8 +206,7 @@ class Scene:
     annotation: Annotation
     names: Mapping[str, str]
     roots: Mapping[str, str]
-    most_off_mm: int
-    most_off_deg: int
+    limits: tuple[int, int]  # most millimetres and degrees that parts are off their hinge
     _objects: dict[str, SceneObject] = field(default_factory=dict)
 
     @property
@@ -246,15 +231,12 @@ class Scene:
     def _mesh(self, name: str) -> Mesh:
         """Read the only mesh in the folder of a part."""
         folders = [f"{folder}/align_ds/{name}" for folder in OBJECTS]
-        meshes = {
-            folder_path: [n for n in self.raw.names(folder_path) if n.lower().endswith((".obj", ".ply"))]
-            for folder_path in folders
-        }
-        folder = next((folder_path for folder_path in folders if meshes[folder_path]), folders[0])
-        if len(meshes[folder]) != 1:
-            got = ", ".join(meshes[folder]) or "none"
+        meshes = [[n for n in self.raw.names(folder) if n.lower().endswith((".obj", ".ply"))] for folder in folders]
+        folder, names = next((pair for pair in zip(folders, meshes, strict=True) if pair[1]), (folders[0], []))
+        if len(names) != 1:
+            got = ", ".join(names) or "none"
             raise BadInput(folder, "one mesh, OBJ or PLY", got, "unpack object_repair.tar or object_raw.tar here")
-        return raw_mesh(self.raw, f"{folder}/{meshes[folder][0]}")
+        return raw_mesh(self.raw, f"{folder}/{names[0]}")
 
     def _words(self, *ids: str) -> str | None:
         return next((noun_of(self.names[name]) for name in ids if self.names.get(name, "").strip(" _")), None)
@@ -262,9 +244,8 @@ class Scene:
     def _part(self, name: str) -> SceneObject:
         mesh, poses = self._mesh(name), self.annotation.parts[name]
         model = ObjectModel(name, mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), np.uint8))
-        return SceneObject(
-            bridge(_track(model, poses.world_from_part), poses.tracked), poses.tracked, self._words(name)
-        )
+        track = bridge(_track(model, poses.world_from_part), poses.tracked)
+        return SceneObject(track, poses.tracked, self._words(name))
 
     def _hinged(self, root: str, pair: list[str]) -> SceneObject | None:
         """Join two parts by a hinge. The part with the larger surface is the base. None if no hinge fits.
@@ -280,31 +261,29 @@ class Scene:
         poses = [self.annotation.parts[name].world_from_part[tracked] for name in (base, moving)]
         relative = np.linalg.inv(poses[0]) @ poses[1]
         base_vertices, faces = meshes[base].vertices, [meshes[name].faces for name in (base, moving)]
-        limits = (self.most_off_mm, self.most_off_deg)
         for rest in (np.eye(4), relative[0]):
             moving_vertices = meshes[moving].vertices @ rest[:3, :3].T + rest[:3, 3]
             corners = box_corners(base_vertices), box_corners(moving_vertices)
-            hinge_fit = hinge_between(poses[0], relative @ np.linalg.inv(rest), corners, *limits)
+            hinge_fit = hinge_between(poses[0], relative @ np.linalg.inv(rest), corners, *self.limits)
             if hinge_fit is not None:
                 model = hinged_model(root, [base_vertices, moving_vertices], faces, hinge_fit[0])
                 return self._joined(model, hinge_fit[1], tracked, self._words(root, base))
         return None
 
     def _joined(self, model: ObjectModel, fit: HingeFit, tracked: np.ndarray, words: str | None) -> SceneObject:
-        limits, frames = (self.most_off_mm, self.most_off_deg), np.flatnonzero(tracked)
-        exceeds, used_frames = fit.exceeds(*limits), tracked.copy()
+        frames = np.flatnonzero(tracked)
+        exceeds, used_frames = fit.exceeds(*self.limits), tracked.copy()
         used_frames[frames[exceeds]] = False
         reason_key = f"{self.key}/hinge of {model.name}"
         rejected_frames: tuple[Quarantined, ...] = ()
         if exceeds.any():
             source_frames = self.annotation.frames[frames]
-            rejected_frames = (fit.rejected_frames_reason(reason_key, self.path, source_frames, *limits),)
+            rejected_frames = (fit.rejected_frames_reason(reason_key, self.path, source_frames, *self.limits),)
         # Frames in which a part is untracked repeat the previous pose, until short gaps are interpolated.
         last_tracked = np.clip(np.searchsorted(frames, np.arange(len(tracked)), side="right") - 1, 0, None)
         track = _track(model, fit.world_from_object[last_tracked], fit.hinge_rad[last_tracked])
-        return SceneObject(
-            bridge(track, used_frames), used_frames, words, f"{model.name}: {fit.note}", rejected_frames=rejected_frames
-        )
+        note = f"{model.name}: {fit.note}"
+        return SceneObject(bridge(track, used_frames), used_frames, words, note, rejected_frames=rejected_frames)
 
 
 def _surface_m2(mesh: Mesh) -> float:

@@ -19,61 +19,37 @@ from hoidata.files import load_torch_pickle
 
 UNKNOWN = "?(unk)"
 # Verbs of primitives that differ from the primitive's words, because the sentence names the object separately.
-_VERBS = {
-    "brush_whiteboard": "brush with",
-    "cap_the_pen": "cap",
-    "close_book": "close",
-    "close_gate": "close",
-    "close_laptop_lid": "close",
-    "flip_close_tooth_paste_cap": "close",
-    "flip_open_tooth_paste_cap": "open",
-    "heat_beaker": "heat",
-    "heat_test_tube": "heat",
-    "hold_test_tube": "hold",
-    "ignite_alcohol_lamp": "light",
-    "insert_lightbulb": "insert",
-    "insert_pencil": "insert",
-    "insert_usb": "insert",
-    "open_book": "open",
-    "open_gate": "open",
-    "open_laptop_lid": "open",
-    "place_asbestos_mesh": "place",
-    "place_inside": "put in",
-    "place_on_test_tube_rack": "place",
-    "place_onto": "place",
-    "place_test_tube_on_rack_with_holder": "place",
-    "plug_in_power_plug": "plug in",
-    "pour_in_lab": "pour",
-    "press_button": "press",
-    "pull_out_drawer": "pull out",
-    "push_in_drawer": "push in",
-    "put_flower_into_vase": "put in",
-    "put_off_alcohol_lamp": "put out",
-    "put_on_lid": "put on",
-    "remove_from_test_tube_rack": "remove",
-    "remove_lid": "remove",
-    "remove_lightbulb": "remove",
-    "remove_pencil": "remove",
-    "remove_power_plug": "remove",
-    "remove_test_tube": "remove",
-    "remove_test_tube_from_rack_with_holder": "remove",
-    "remove_the_pen_cap": "uncap",
-    "remove_usb": "remove",
-    "shake_lab_container": "shake",
-    "sharpen_pencil": "sharpen",
-    "shear_paper": "cut with",
-    "squeeze_tooth_paste": "squeeze",
-    "staple_paper_together": "staple with",
-    "stir_experiment_substances": "stir",
-    "take_outside": "take out",
-    "trigger_lever": "press",
-    "uncap_alcohol_lamp": "uncap",
-    "use_gamecontroller": "use",
-    "use_keyboard": "use",
-    "use_mouse": "use",
-    "write_on_paper": "write with",
-    "write_on_whiteboard": "write with",
-}
+_VERBS = {primitive: verb for verb, primitives in {
+    "brush with": "brush_whiteboard",
+    "cap": "cap_the_pen",
+    "close": "close_book close_gate close_laptop_lid flip_close_tooth_paste_cap",
+    "cut with": "shear_paper",
+    "heat": "heat_beaker heat_test_tube",
+    "hold": "hold_test_tube",
+    "insert": "insert_lightbulb insert_pencil insert_usb",
+    "light": "ignite_alcohol_lamp",
+    "open": "flip_open_tooth_paste_cap open_book open_gate open_laptop_lid",
+    "place": "place_asbestos_mesh place_on_test_tube_rack place_onto place_test_tube_on_rack_with_holder",
+    "plug in": "plug_in_power_plug",
+    "pour": "pour_in_lab",
+    "press": "press_button trigger_lever",
+    "pull out": "pull_out_drawer",
+    "push in": "push_in_drawer",
+    "put in": "place_inside put_flower_into_vase",
+    "put on": "put_on_lid",
+    "put out": "put_off_alcohol_lamp",
+    "remove": "remove_from_test_tube_rack remove_lid remove_lightbulb remove_pencil remove_power_plug remove_test_tube "
+              "remove_test_tube_from_rack_with_holder remove_usb",
+    "shake": "shake_lab_container",
+    "sharpen": "sharpen_pencil",
+    "squeeze": "squeeze_tooth_paste",
+    "staple with": "staple_paper_together",
+    "stir": "stir_experiment_substances",
+    "take out": "take_outside",
+    "uncap": "remove_the_pen_cap uncap_alcohol_lamp",
+    "use": "use_gamecontroller use_keyboard use_mouse",
+    "write with": "write_on_paper write_on_whiteboard",
+}.items() for primitive in primitives.split()}  # fmt: skip
 
 
 def verb_of(primitive: str) -> str | None:
@@ -293,9 +269,8 @@ def read_names(data: bytes, path: str) -> dict[str, str]:
 def read_roots(data: bytes, location: str) -> dict[str, str]:
     """Read ``object_part_tree.json``: id of the root node by part id. Raises BadInput."""
     value = checks.json_value(location, data)
-    if not isinstance(value, Mapping) or not all(
-        isinstance(names, list) and all(isinstance(name, str) for name in names) for names in value.values()
-    ):
+    lists = list(value.values()) if isinstance(value, Mapping) else [None]
+    if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists):
         raise BadInput(location, "a dictionary of lists of part ids", repr(value)[:40])
     parent = {child: node for node, children in value.items() for child in children}
     topmost: dict[str, str] = {}

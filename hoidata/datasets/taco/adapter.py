@@ -33,12 +33,9 @@ FRAME_KEY = re.compile(r"\D*(\d{1,9})")  # 00012, with an optional prefix
 FRAME = WorldFrame(None, "unknown", "the capture rig's world of the recording day, right-handed, metres")
 SHAPE_NOTE = "no {side}_hand_shape.pkl: its betas are zero, as in TACO's own loader"
 GRAVITY_NOTE = "TACO's world frame differs from day to day and its axes are not documented"
+HAND_NOTE = "MANO: absolute axis-angles, own betas for each side, the translation is the wrist (manopth, center_idx 0)"
 CONVENTION = HandConvention(
-    translation="wrist",
-    fingers="absolute",
-    shape="betas per sequence",
-    left_shape="as released",
-    note="MANO: absolute axis-angles, own betas for each side, the translation is the wrist (manopth, center_idx 0)",
+    translation="wrist", fingers="absolute", shape="betas per sequence", left_shape="as released", note=HAND_NOTE
 )
 PARTS = (
     DatasetPart("hand motion and shapes", (f"{HANDS}/*/*/*.pkl",), "Hand_Poses.zip"),
@@ -90,11 +87,8 @@ class TacoAdapter(AdapterBase):
         without_shape: list[Side] = [side for side in SIDES if not _has_shape(raw, key, side)]
         notes = [clip.gravity_note, *(SHAPE_NOTE.format(side=side) for side in without_shape)]
         remedy = "nothing to do: the clip has zero betas, as TACO's own loader gives them"
-        absent = "the shape of the hand", "no file", remedy
-        reasons = [
-            Quarantined.from_error(f"{key}/{side}-shape", BadInput(_shape_path(key, side), *absent))
-            for side in without_shape
-        ]
+        absent = {"expected": "the shape of the hand", "got": "no file", "remedy": remedy}
+        reasons = [Quarantined(f"{key}/{side}-shape", _shape_path(key, side), **absent) for side in without_shape]
         return [replace(clip, sources=raw.sources, gravity_note="; ".join(notes)), *reasons]
 
 
@@ -114,16 +108,12 @@ def frames_by_side(folder: str, keys: Mapping[Side, list[Hashable]], n_frames: i
     If a side has one key per frame, its sorted keys are the frames in order. If neither side is complete, the numbers
     must be 0 to n - 1 or 1 to n, as the first and last number show; else BadInput is raised.
     """
-    numbers: dict[Side, dict[Hashable, int]] = {
-        side: _numbers(f"{folder}/{side}_hand.pkl", keys[side], n_frames) for side in SIDES
-    }
-    complete = next(
-        (sorted(side_numbers.values()) for side_numbers in numbers.values() if len(side_numbers) == n_frames), None
-    )
+    numbers = dict[Side, dict[Hashable, int]]()
+    for side in SIDES:
+        numbers[side] = _numbers(f"{folder}/{side}_hand.pkl", keys[side], n_frames)
+    complete = next((sorted(of_side.values()) for of_side in numbers.values() if len(of_side) == n_frames), None)
     if complete is None:
-        first = _first_number(
-            folder, {number for side_numbers in numbers.values() for number in side_numbers.values()}, n_frames
-        )
+        first = _first_number(folder, {number for of_side in numbers.values() for number in of_side.values()}, n_frames)
         complete = list(range(first, first + n_frames))
     frame = {number: index for index, number in enumerate(complete)}
     frames_by_key: dict[Side, dict[Hashable, int]] = {}
@@ -217,9 +207,8 @@ def _object(raw: RawTree, key: SequenceKey, kind: str) -> ObjectTrack:
     folder = f"{OBJECTS}/{key.name}"
     names = [name for name in raw.names(folder, ".npy") if name.startswith(f"{kind}_")]
     if len(names) != 1:
-        raise BadInput(
-            f"{folder}/{kind}_<id>.npy", "poses of one object", f"{len(names)}: {', '.join(names) or 'none'}"
-        )
+        got = f"{len(names)}: {', '.join(names) or 'none'}"
+        raise BadInput(f"{folder}/{kind}_<id>.npy", "poses of one object", got)
     path = f"{folder}/{names[0]}"
     poses = load_npy(raw.file(path))
     if poses.dtype.kind != "f" or poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):

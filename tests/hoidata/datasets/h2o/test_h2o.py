@@ -219,27 +219,13 @@ TRAIN = b"""id path action_label start_act end_act start_frame end_frame
 TEST = b"id path start_act end_act start_frame end_frame\r\n1 subject4/o1/0 30 75 0 599\r\n"
 
 
-def segment(sequence: str, label: int | None, action: tuple[int, int], frames: tuple[int, int]) -> Segment:
-    """action, frames: first and last frame of the action and of the sequence."""
-    return Segment(
-        sequence=sequence,
-        label=label,
-        start=action[0],
-        last=action[1],
-        first_frame=frames[0],
-        last_frame=frames[1],
-    )
-
-
 def test_the_lists_give_their_segments_with_and_without_labels():
     assert parse_segments(TRAIN, "label_split/action_train.txt") == [
-        segment("subject1/h1/0", 16, action=(0, 61), frames=(0, 449)),
-        segment("subject1/h1/0", 27, action=(62, 138), frames=(0, 449)),
-        segment("subject3/k1/7", 36, action=(5, 99), frames=(0, 120)),
+        Segment("subject1/h1/0", 16, 0, 61),
+        Segment("subject1/h1/0", 27, 62, 138),
+        Segment("subject3/k1/7", 36, 5, 99),
     ]
-    assert parse_segments(TEST, "label_split/action_test.txt") == [
-        segment("subject4/o1/0", None, action=(30, 75), frames=(0, 599))
-    ]
+    assert parse_segments(TEST, "label_split/action_test.txt") == [Segment("subject4/o1/0", None, 30, 75)]
 
 
 BAD_LISTS = {
