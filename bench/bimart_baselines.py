@@ -31,8 +31,7 @@ from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import TIP_VERTICES
 from hoidata.objects.model import articulate
 from hoidata.refinement import GeneratedKeypoints, fit_hands
-from hoidata.sensors.keypoints import hand_keypoints
-from hoidata.sensors.part_bps import BasisSettings
+from hoidata.sensors.part_bps import BasisSettings, hand_keypoints
 from models.bimart.family import clip_without_hands, world_from_canonical
 from models.bimart.network import layout_of
 from models.bimart.retrieval import canonical_hands, moved_hands, scene_features

@@ -17,9 +17,8 @@ from hoidata.clips import HandTrack, ObjectTrack
 from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ProximityIndex
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandKinematics, load_embedded_hands, track_joints, track_rotmats
-from hoidata.objects.farthest import farthest_points
 from hoidata.objects.model import Hinge, ObjectModel, articulate
-from hoidata.objects.sampling import SampledPoints, sample_points
+from hoidata.objects.sampling import SampledPoints, farthest_points, sample_points
 
 RUNS, CLIPS, FRAMES, JOINTS = 7, 40, 150, 21
 

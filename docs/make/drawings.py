@@ -18,7 +18,7 @@ from hoidata.clips.clip import SIDES, HandTrack
 from hoidata.dataset_folders import built_in_names, dataset_facts, dataset_title
 from hoidata.datasets.registry import get_adapter
 from hoidata.hands import load_embedded_hands
-from hoidata.hands.tracks import track_vertices
+from hoidata.hands.kinematics import track_vertices
 from hoidata.store.annotated import load_annotated
 from hoidata.surface.measure import measure_hand
 from pipelines.lineage.graph import written_graph

@@ -12,8 +12,8 @@ import numpy as np
 
 from hoidata.clips.clip import HandTrack, ObjectTrack
 from hoidata.geometry.rotations import rotmat_to_rot6d, rotvec_to_rotmat
+from hoidata.hands.kinematics import track_rotmats
 from hoidata.hands.model import N_ROTATIONS
-from hoidata.hands.tracks import track_rotmats
 
 _POSITION, _ROT6D = 3, 6
 WRIST = slice(0, _POSITION)

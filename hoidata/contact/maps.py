@@ -13,17 +13,13 @@ LONGEST_CLIP = int(np.iinfo(np.int16).max)
 
 
 def find_active_hands(
-    clip: Clip,
-    joints_m: Mapping[Side, np.ndarray],
-    index: ProximityIndex,
-    threshold_m: float = CONTACT_THRESHOLD_M,
+    clip: Clip, joints_m: Mapping[Side, np.ndarray], index: ProximityIndex, threshold_m: float = CONTACT_THRESHOLD_M
 ) -> HandEvidence:
     """Find the active hands: a joint is closer than ``threshold_m`` to a sampled point in any valid frame.
 
     The proximity test of Text2HOI (supplement, section 6).
 
     Args:
-        clip: the clip.
         joints_m: by side, (frame, 21, 3) world joints, metres.
         index: index of ``sample_points(clip.object.model)``.
         threshold_m: a hand is active below it.
@@ -36,10 +32,7 @@ def find_active_hands(
 
 
 def distance_entries(
-    clip: Clip,
-    joints_m: Mapping[Side, np.ndarray],
-    index: ProximityIndex,
-    threshold_m: float = CONTACT_THRESHOLD_M,
+    clip: Clip, joints_m: Mapping[Side, np.ndarray], index: ProximityIndex, threshold_m: float = CONTACT_THRESHOLD_M
 ) -> dict[Side, np.ndarray]:
     """Return, by hand, all (frame, point, joint) closer than ``threshold_m`` as ``ENTRY`` records.
 

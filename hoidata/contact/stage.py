@@ -55,15 +55,11 @@ def contact_store(
     """Write contact and distance maps of each clip of the store; the folder appears whole or not at all.
 
     Args:
-        clips_folder: the store.
-        out_folder: folder to write.
-        settings: settings of the stage.
         hands: as in ``open_store``.
         jobs: maximum number of worker processes; the result does not depend on it.
         changes: fields that replace those of ``settings``.
 
-    Returns:
-        Counts: clips, objects, entries, clips_without_contact.
+    Returns counts: clips, objects, entries, clips_without_contact.
     """
     settings = replace(settings or ContactSettings(), **changes)
     store, points = open_store(clips_folder, hands), settings.points
@@ -144,14 +140,13 @@ class _Writer:
             self._write_shard()
 
     def _write_shard(self) -> None:
-        columns = {name: self._column(name) for name in ENTRY.names or ()}
+        columns = {
+            name: np.concatenate([np.zeros(0, ENTRY[name]), *(entries[name] for entries in self.pending)])
+            for name in ENTRY.names or ()
+        }
         write_npz(self.folder / f"distances-{self.shard:05d}.npz", columns)
         self.written_rows += self.pending_rows
         self.pending, self.pending_rows, self.shard = [], 0, self.shard + 1
-
-    def _column(self, name: str) -> np.ndarray:
-        """Concatenate one column at a time: all columns of a shard would need another 75 MB."""
-        return np.concatenate([np.zeros(0, ENTRY[name]), *(entries[name] for entries in self.pending)])
 
     def finish(self) -> dict[str, int]:
         if self.pending or not self.shard:

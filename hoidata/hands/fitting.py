@@ -15,9 +15,9 @@ from torch import Tensor
 
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.hands.kinematics import kinematics_of
 from hoidata.hands.model import N_JOINTS, N_SHAPE, TIP_VERTICES, HandModel, HandPair, Side
 from hoidata.hands.solver import FINGER_POINTS, Pose, Problem, better_pose, pose_step, predict, shape_step
-from hoidata.hands.tracks import kinematics_of
 
 KNUCKLES = [1, 4, 7, 10, 13]
 THUMB = 4
@@ -60,8 +60,7 @@ def fit_hands(
         keypoints_m: per side (frame, 21, 3) world positions; NaN for an unknown keypoint.
         betas: (10,) the shape, if known. By default one shape of both sides is fitted first (``fit_shape``).
 
-    Raises:
-        BadInput: an array of another shape, or a frame with less than three known keypoints on the palm.
+    Raises BadInput: an array of another shape, or a frame with less than three known keypoints on the palm.
     """
     if betas is None:
         betas = fit_shape(keypoints_m, hands)
@@ -129,9 +128,7 @@ def pose_precision(rest: np.ndarray) -> np.ndarray:
     """Precision (5, 9, 9) of the prior of each finger's axis-angles, times the squared noise, in squared metres.
 
     The hinge axis is across the bone in the plane of the palm. A thumb bends about any axis across its bone.
-
-    Args:
-        rest: (21, 3) keypoints at rest.
+    rest: (21, 3) keypoints at rest.
     """
     palm_normal = _unit(np.cross(rest[1] - rest[0], rest[7] - rest[0]))
     precision = np.zeros((5, 9, 9))

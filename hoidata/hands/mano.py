@@ -57,12 +57,8 @@ MANO_KEYS = {
 def load_mano_hands(folder: str | Path) -> HandPair:
     """Load both hands of a MANO download, named "mano".
 
-    Args:
-        folder: the folder of MANO_LEFT.pkl and MANO_RIGHT.pkl, or the unpacked ``mano_v1_2``.
-
-    Raises:
-        MissingResource: a file is missing.
-        BadInput: a file is not a MANO file.
+    folder: the folder of MANO_LEFT.pkl and MANO_RIGHT.pkl, or the unpacked ``mano_v1_2``.
+    Raises MissingResource for a missing file, and BadInput for a file that is not a MANO file.
     """
     return HandPair(left=_load_side(Path(folder), "left"), right=_load_side(Path(folder), "right"))
 
@@ -117,6 +113,7 @@ def _dense(source: str, value: Any) -> np.ndarray:
 
 
 def _dense_csc(state: dict[str, Any]) -> np.ndarray:
+    # Not by SciPy, whose matrices end the process with a segmentation fault for some wrong arrays.
     rows, columns = (int(length) for length in state["_shape"])
     if not (0 < rows <= 1024 and 0 < columns <= 1024):
         raise ValueError(f"matrix of shape {(rows, columns)}")

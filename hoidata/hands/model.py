@@ -72,12 +72,8 @@ class HandModel:
     def rest_joints_m(self, betas: np.ndarray, template_m: np.ndarray | None = None) -> np.ndarray:
         """Joints of the unposed hand, in the model's frame.
 
-        Args:
-            betas: (frame, 10) shape coefficients.
-            template_m: (778, 3) personal rest mesh instead of the model's template.
-
-        Returns:
-            (frame, 16, 3) metres.
+        betas: (frame, 10) shape coefficients. template_m: (778, 3) personal rest mesh instead of the model's template.
+        Returns (frame, 16, 3) metres.
         """
         betas = np.asarray(betas, dtype=np.float64)
         template = self.template_m if template_m is None else np.asarray(template_m, dtype=np.float64)

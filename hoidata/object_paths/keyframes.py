@@ -95,15 +95,12 @@ def keyframed_path(
     """Interpolate keyframes to 30 frames per second; the object reaches each keyframe at its time.
 
     Args:
-        model: the object.
-        keys: the keyframes.
         limits_rad: smallest and largest joint position, radians or metres, if known.
         source: where the keyframes are from, for messages.
         standing: as in ``checked_path``.
 
-    Raises:
-        BadInput: joint positions that do not fit the object's joint, an ambiguous rotation, or a path that
-            ``checked_path`` refuses.
+    Raises BadInput: joint positions that do not fit the object's joint, an ambiguous rotation, or a path that
+    ``checked_path`` refuses.
     """
     _check_joint(model, keys, source)
     steps = [

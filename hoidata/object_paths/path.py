@@ -58,14 +58,8 @@ def smooth(time_s: np.ndarray, values: np.ndarray, at_s: np.ndarray) -> np.ndarr
 
     The acceleration is zero at the keys. The velocity at a key is that of a monotone cubic (Fritsch and Carlson 1980),
     so that the curve does not overshoot. Between two stops this is the minimum-jerk motion (Flash and Hogan 1985).
-
-    Args:
-        time_s: (key,) ascending.
-        values: (key, ...).
-        at_s: (frame,) times of the result.
-
-    Returns:
-        (frame, ...) interpolated values.
+    time_s: (key,) ascending. values: (key, ...). at_s: (frame,) times of the result.
+    Returns (frame, ...) interpolated values.
     """
     slope = np.zeros_like(values)
     if len(time_s) > 2:
@@ -91,7 +85,6 @@ def checked_path(
     """Build the path of an object and check it.
 
     Args:
-        model: the object.
         shift_m: (frame, 3) translation from the start.
         rotmats: (frame, 3, 3) rotation from the start, about the centre of the bounding box.
         hinge_rad: (frame,) joint position as in ``ObjectTrack``.
@@ -99,9 +92,8 @@ def checked_path(
         limits_rad: smallest and largest joint position, if known.
         standing: (3, 3) world-from-object at the start, if the object's z axis is not up.
 
-    Raises:
-        BadInput: the angle is outside the limits, a speed or acceleration is beyond a hand's, or the object is below
-            the table.
+    Raises BadInput: the angle is outside the limits, a speed or acceleration is beyond a hand's, or the object is below
+    the table.
     """
     standing = np.eye(3) if standing is None else standing
     standing_m = model.vertices_m @ standing.T

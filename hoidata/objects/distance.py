@@ -39,13 +39,8 @@ class MergedSurface(NamedTuple):
 def closest_points(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndarray) -> ClosestPoints:
     """Closest point of a mesh to each query point.
 
-    Args:
-        vertices_m: (vertex, 3), any frame.
-        faces: (face, 3).
-        points_m: (point, 3), same frame.
-
-    Raises:
-        BadInput: the mesh has no triangle of positive area, or a vertex is not finite.
+    vertices_m: (vertex, 3), any frame. faces: (face, 3). points_m: (point, 3), same frame.
+    Raises BadInput: the mesh has no triangle of positive area, or a vertex is not finite.
     """
     surface = merged_surface(vertices_m, faces)
     parts = [igl.point_mesh_squared_distance(chunk, *surface)[::2] for chunk in _chunks(points_m)]

@@ -41,8 +41,7 @@ def no_grid() -> DistanceGrid:
 def distance_grid(tree: TriangleTree, solid: bool) -> DistanceGrid:
     """Compute a grid over a surface and 1 cm around it, with about as many cells as a cube of 64 x 64 x 64.
 
-    Args:
-        solid: the surface is closed, so distances inside are negative.
+    solid: the surface is closed, so distances inside are negative.
     """
     low, high = tree.box[0, :3] - MARGIN_M, tree.box[0, 3:] + MARGIN_M
     cell = float(np.cbrt(np.prod(high - low))) / CELLS

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hoidata.errors import BadInput
+from hoidata.objects.mesh import Mesh, joined
 from hoidata.objects.ply import MOST_TRIANGLES
 
 _MAX_JSON_BYTES = 4 << 20
@@ -43,8 +44,7 @@ class Glb(NamedTuple):
 def parse_glb(data: bytes, path: str | Path) -> Glb:
     """Parse the triangles of a GLB file; ``path`` names the file in errors.
 
-    Raises:
-        BadInput: the data are not a GLB file, or an unsupported extension changes the shape.
+    Raises BadInput: the data are not a GLB file, or an unsupported extension changes the shape.
     """
     try:
         tree, binary = _chunks(data)
@@ -116,14 +116,13 @@ class _Scene:
         self.nodes = tree.get("nodes", [])
         self.world: dict[int, np.ndarray] = {}  # (4, 4) scene from node, of the nodes of the scene
         self.parent: dict[int, int | None] = {}
-        self.meshes: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self.meshes: dict[tuple[int, tuple], Mesh] = {}  # by number and weights of the morph targets
 
     def triangles(self) -> Glb:
         """The triangles of all nodes of the scene, in scene coordinates."""
         self._place_nodes()
         showing = sorted(number for number in self.world if "mesh" in self.nodes[number])
-        vertices, faces, counts = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], []
-        start = n_triangles = 0
+        meshes, n_triangles = list[Mesh](), 0
         for number in showing:
             node = self.nodes[number]
             points, corners = self._node_mesh(node)
@@ -137,22 +136,14 @@ class _Scene:
                 points = _transform(points, matrix)
                 if _determinant(matrix) < 0:  # the specification flips the triangles of a mirrored node
                     corners = corners[:, ::-1]
-            vertices.append(points)
-            faces.append(corners + start)
-            counts.append(len(corners))
-            start += len(points)
+            meshes.append(Mesh(points, corners))
         names = [str(node.get("name", ""))[:60] for node in self.nodes]
-        nodes = np.array(showing, dtype=np.int64)
         branch = self._branches(set(showing))
-        branches = np.array([branch[number] for number in showing], dtype=np.int64)
-        times = np.array(counts, dtype=np.int64)
-        return Glb(
-            vertices=np.concatenate(vertices),
-            faces=np.concatenate(faces),
-            node=nodes.repeat(times),
-            branch=branches.repeat(times),
-            names=names,
+        nodes, branches, times = (
+            np.array(numbers, dtype=np.int64)
+            for numbers in (showing, [branch[number] for number in showing], [len(mesh.faces) for mesh in meshes])
         )
+        return Glb(*joined(meshes), node=nodes.repeat(times), branch=branches.repeat(times), names=names)
 
     def _spend(self, corners: int) -> None:
         self.budget -= corners
@@ -200,26 +191,15 @@ class _Scene:
             branch[number] = number if parent is None or parent in undivided else branch[parent]
         return branch
 
-    def _node_mesh(self, node: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (vertex, 3) and triangles (face, 3) of a node's mesh, in the node's frame, with morph targets."""
-        number = node["mesh"]
-        mesh = _at(self.tree["meshes"], number)
-        weights = node.get("weights", mesh.get("weights", ()))
-        key = number if "weights" not in node else None
-        if key not in self.meshes or key is None:
-            pieces, start = [], 0
-            for primitive in _triangle_primitives(mesh):
-                points, corners = self._primitive(primitive, weights)
-                pieces.append((points, corners + start))
-                start += len(points)
-            vertices = np.concatenate([np.zeros((0, 3)), *(points for points, _ in pieces)])
-            faces = np.concatenate([np.zeros((0, 3), np.int64), *(corners for _, corners in pieces)])
-            if key is None:
-                return vertices, faces
-            self.meshes[key] = vertices, faces
+    def _node_mesh(self, node: dict[str, Any]) -> Mesh:
+        """A node's mesh in the node's frame, with morph targets."""
+        mesh = _at(self.tree["meshes"], node["mesh"])
+        key = node["mesh"], tuple(node.get("weights", mesh.get("weights", ())))
+        if key not in self.meshes:
+            self.meshes[key] = joined([self._primitive(item, key[1]) for item in _triangle_primitives(mesh)])
         return self.meshes[key]
 
-    def _primitive(self, primitive: dict[str, Any], weights: Any) -> tuple[np.ndarray, np.ndarray]:
+    def _primitive(self, primitive: dict[str, Any], weights: tuple) -> Mesh:
         points = self._accessor(primitive["attributes"]["POSITION"])
         if points.shape[1] != 3:
             raise ValueError(f"positions of {points.shape[1]} numbers")
@@ -232,7 +212,7 @@ class _Scene:
         faces = _triangles(order.astype(np.int64), mode)
         if len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
             raise ValueError(f"corner {faces.max()} of {len(points)} vertices")
-        return points.astype(np.float64), faces
+        return Mesh(points.astype(np.float64), faces)
 
     def _apply_skin(self, node: dict[str, Any], points: np.ndarray) -> np.ndarray:
         """Vertices deformed by the joints of a skin, which ignores the node's transform."""

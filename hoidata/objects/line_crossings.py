@@ -30,8 +30,7 @@ class Intervals(NamedTuple):
 def intervals_inside(tree: TriangleTree, cell_m: float) -> Intervals:
     """Intersect a lattice of lines, centred on the bounding box, with the solid that a closed surface bounds.
 
-    Args:
-        cell_m: distance between lines.
+    cell_m: distance between lines.
     """
     low, high = tree.box[0, 1:3], tree.box[0, 4:]
     shape = np.ceil((high - low) / cell_m - 1e-9).astype(np.int64)  # rounding must not add a cell

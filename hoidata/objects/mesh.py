@@ -2,7 +2,7 @@
 
 import io
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -51,11 +51,9 @@ class MassProperties(NamedTuple):
 def load_mesh(path: str | Path) -> Mesh:
     """Read vertices and triangles of an OBJ, PLY or STL file; polygons become fans.
 
-    The reader does not merge, reorder or drop vertices, because per-vertex files (part ids, contacts) index them.
-    Only equal corners of an STL file, which has no shared vertices, are merged and sorted.
-
-    Raises:
-        BadInput: the file holds no finite triangle mesh.
+    The reader does not merge, reorder or drop vertices, because per-vertex files (part ids, contacts) index them. Only
+    equal corners of an STL file, which has no shared vertices, are merged and sorted. Raises BadInput: the file holds
+    no finite triangle mesh.
     """
     return load_named_mesh(path)[0]
 
@@ -63,24 +61,36 @@ def load_mesh(path: str | Path) -> Mesh:
 def load_named_mesh(path: str | Path) -> tuple[Mesh, list[NamedPieces]]:
     """Read a mesh as ``load_mesh`` does, with the named objects and groups of an OBJ file, and the solids of an STL."""
     path = Path(path)
-    if not path.is_file():
-        raise BadInput(path, "a mesh file", "nothing there")
-    if path.stat().st_size > LARGEST_MESH_BYTES:
-        raise BadInput(path, f"at most {LARGEST_MESH_BYTES} bytes", f"{path.stat().st_size}", "decimate the mesh")
-    reader = {".obj": _read_obj, ".ply": _read_ply, ".stl": _read_stl}.get(path.suffix.lower())
-    if reader is None:
-        remedy = "read .glb with hoidata.objects.user_mesh.read_mesh_file; convert others"
-        raise BadInput(path, "a mesh named .obj, .ply or .stl", path.suffix or "no suffix", remedy)
+    data = read_mesh_bytes(path)
+    pieces = list[NamedPieces]()
     try:
-        mesh, pieces = reader(path)
-    except (ValueError, OSError) as error:
+        match path.suffix.lower():
+            case ".obj":  # a byte order mark, which some programs write, would hide the first line
+                mesh, pieces = _parse_named_obj(data.decode("utf-8-sig", "replace"), path)
+            case ".ply":
+                mesh = Mesh(*parse_ply(data))
+            case ".stl":
+                corners, solid, names = parse_stl(data)
+                first, number = distinct_rows(corners)
+                mesh, pieces = Mesh(corners[first], number.reshape(-1, 3)), [NamedPieces("solids", names, solid)]
+            case _:
+                remedy = "read .glb with hoidata.objects.user_mesh.read_mesh_file; convert others"
+                raise BadInput(path, "a mesh named .obj, .ply or .stl", path.suffix or "no suffix", remedy)
+    except ValueError as error:
         raise BadInput(path, "a readable mesh", f"{type(error).__name__}: {error}") from error
     return checked_mesh(path, mesh), pieces
 
 
-def _read_obj(path: Path) -> tuple[Mesh, list[NamedPieces]]:
-    # A byte order mark, which some programs write, would hide the first line.
-    return _parse_named_obj(path.read_text(encoding="utf-8-sig", errors="replace"), path)
+def read_mesh_bytes(path: Path, remedy: str = "download it again") -> bytes:
+    """The bytes of a mesh file. Raises BadInput without a readable file (with ``remedy``), or if it is too large."""
+    if not path.is_file():
+        raise BadInput(path, "a mesh file", "nothing there", remedy)
+    if path.stat().st_size > LARGEST_MESH_BYTES:
+        raise BadInput(path, f"at most {LARGEST_MESH_BYTES} bytes", f"{path.stat().st_size}", "decimate the mesh")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise BadInput(path, "a readable mesh", f"{type(error).__name__}: {error}") from error
 
 
 def parse_obj(text: str, path: str | Path) -> Mesh:
@@ -178,14 +188,12 @@ def _vertex_number(corner: str, n_vertices: int) -> int:
     return index - 1 if index > 0 else n_vertices + index
 
 
-def _read_ply(path: Path) -> tuple[Mesh, list[NamedPieces]]:
-    return Mesh(*parse_ply(path.read_bytes())), []
-
-
-def _read_stl(path: Path) -> tuple[Mesh, list[NamedPieces]]:
-    corners, solid, names = parse_stl(path.read_bytes())
-    first, number = distinct_rows(corners)
-    return Mesh(corners[first], number.reshape(-1, 3)), [NamedPieces("solids", names, solid)]
+def joined(meshes: Sequence[Mesh]) -> Mesh:
+    """One mesh with the vertices and faces of several, in their order."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    vertices = np.concatenate([np.zeros((0, 3)), *(mesh.vertices for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
+    return Mesh(vertices, np.concatenate([np.zeros((0, 3), np.int64), *faces]))
 
 
 def checked_mesh(path: str | Path, mesh: Mesh) -> Mesh:

@@ -117,16 +117,13 @@ class ObjectModel:
         used, corners = np.unique(self.faces_of(part), return_inverse=True)
         return self.vertices_m[used], corners.reshape(-1, 3)
 
-    def closed_part(self, part: int) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (vertex, 3) and faces (face, 3) of one part, with the cut between the parts closed.
+    @cached_property
+    def closed_parts(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """By part, vertices (vertex, 3) and faces (face, 3), with the cut between the parts closed.
 
         A surface without such a cut is unchanged. The closing triangles bound a volume; they are not part of the
         object's surface.
         """
-        return self._closed_parts[part]
-
-    @cached_property
-    def _closed_parts(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
         return {
             part: close_cut(self.vertices_m, self.faces_of(part), self.faces[self.face_part != part])
             for part in self.parts
@@ -135,20 +132,13 @@ class ObjectModel:
     @cached_property
     def solids(self) -> dict[int, Solid | NoSolid]:
         """By part, its solid, or the reason why it has none. Raises BadInput for a mesh without triangles."""
-        return {part: solid_of(*self.closed_part(part)) for part in self.parts}
-
-    def filled_part(self, part: int) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices and faces of one part for volumes and signs of distances: the repaired solid, if any.
-
-        For an open mesh, and for a solid without repairs, this is ``closed_part``.
-        """
-        solid = self.solids[part]
-        return solid[:2] if isinstance(solid, Solid) and solid.repairs else self.closed_part(part)
+        return {part: solid_of(*mesh) for part, mesh in self.closed_parts.items()}
 
     @cached_property
     def masses(self) -> tuple[MassProperties, ...]:
-        """Volume, centre of mass and inertia of each of ``parts``, for 1 kg."""
-        return tuple(mass_properties(*self.filled_part(part)) for part in self.parts)
+        """Volume, centre of mass and inertia of each of ``parts``, for 1 kg: of the repaired solid, if any."""
+        repaired = {part: s[:2] for part, s in self.solids.items() if isinstance(s, Solid) and s.repairs}
+        return tuple(mass_properties(*mesh) for mesh in {**self.closed_parts, **repaired}.values())
 
     @cached_property
     def digest(self) -> str:
@@ -167,8 +157,7 @@ class ObjectModel:
             part: 0 for the base, whose pose is the identity; 1 for the part that the hinge moves.
             hinge_rad: (frame,), required for part 1.
 
-        Raises:
-            BadInput: part 1 is requested without angles.
+        Raises BadInput: part 1 is requested without angles.
         """
         if part == 0 or self.hinge is None:
             return IDENTITY
@@ -179,10 +168,7 @@ class ObjectModel:
     def lowest_m(self, world_from_object: RigidTransform, hinge_rad: np.ndarray | None, up: np.ndarray) -> np.ndarray:
         """Height of the lowest vertex in each frame, (frame,) along ``up`` above the world's origin.
 
-        Args:
-            world_from_object: (frame,) poses.
-            hinge_rad: (frame,), None for a rigid object.
-            up: (3,) unit vector, world.
+        world_from_object: (frame,) poses. hinge_rad: (frame,), None for a rigid object. up: (3,) unit vector, world.
         """
         lowest = []
         for part in self.parts:
@@ -212,8 +198,7 @@ def articulate(points_m: np.ndarray, part: np.ndarray, hinge: Hinge | None, hing
         hinge: None for a rigid object.
         hinge_rad: (frame,), None for a rigid object.
 
-    Returns:
-        (frame, point, 3); (1, point, 3) for a rigid object.
+    Returns (frame, point, 3); (1, point, 3) for a rigid object.
     """
     if hinge is None or hinge_rad is None:
         return points_m[None]

@@ -51,11 +51,8 @@ class _Column(NamedTuple):
 def parse_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Parse a PLY file; polygons become fans.
 
-    Returns:
-        Vertices (vertex, 3) float64 in the stored order, and triangles (face, 3) int64.
-
-    Raises:
-        ValueError: the file is not a PLY file, is truncated, or has no vertices.
+    Returns vertices (vertex, 3) float64 in the stored order, and triangles (face, 3) int64. Raises ValueError: the file
+    is not a PLY file, is truncated, or has no vertices.
     """
     order, elements, start = _read_header(data)
     stated = {element.name: element.count for element in elements}

@@ -60,13 +60,8 @@ class DistanceFields:
     def query(self, rows: Tensor, points_m: Tensor, hinge_rad: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance and offset to the closest surface point, object frame.
 
-        Args:
-            rows: (B,) indices of objects.
-            points_m: (B, F, P, 3).
-            hinge_rad: (B, F) ``ObjectTrack.joint_angle_rad``.
-
-        Returns:
-            Distances (B, F, P) and offsets (B, F, P, 3), metres.
+        rows: (B,) indices of objects. points_m: (B, F, P, 3). hinge_rad: (B, F) ``ObjectTrack.joint_angle_rad``.
+        Returns distances (B, F, P) and offsets (B, F, P, 3), metres.
         """
         rows = send(rows, points_m.device)
         rotation = rotvec_to_rotmat(self.axis[rows][:, None] * hinge_rad[..., None])

@@ -85,8 +85,7 @@ def close_cut(vertices_m: np.ndarray, faces: np.ndarray, neighbours: np.ndarray)
         faces: (face, 3) of the part.
         neighbours: (face, 3) of the rest of the mesh.
 
-    Returns:
-        Vertices, with the centres of the fans appended, and faces of the part.
+    Returns vertices, with the centres of the fans appended, and faces of the part.
     """
     first, number = distinct_rows(np.ascontiguousarray(vertices_m, dtype=np.float64))
     holes = _holes(number[faces]) if len(neighbours) else None
@@ -101,15 +100,9 @@ def close_cut(vertices_m: np.ndarray, faces: np.ndarray, neighbours: np.ndarray)
 def patched_holes(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Close all holes of a mesh, such as a hand's wrist, with fans about the centres of their edges.
 
-    Args:
-        vertices_m: (..., vertex, 3), any number of poses.
-        faces: (face, 3).
-
-    Returns:
-        Vertices, with the centres of the fans appended, and faces.
-
-    Raises:
-        ValueError: an edge has more than two triangles.
+    vertices_m: (..., vertex, 3), any number of poses. faces: (face, 3).
+    Returns vertices, with the centres of the fans appended, and faces. Raises ValueError: an edge has more than two
+    triangles.
     """
     holes = _holes(faces)
     if holes is None:

@@ -110,8 +110,7 @@ class SurfaceIndex:
     def __init__(self, model: ObjectModel, grid_after: int = GRID_PAYS_FROM) -> None:
         """Index the parts of a model; each part gets its grid after ``grid_after`` queries.
 
-        Raises:
-            BadInput: a part has no triangles.
+        Raises BadInput: a part has no triangles.
         """
         self.model = model
         self.solids = model.solids  # by part, the solid that it bounds or the reason why it bounds none
@@ -136,8 +135,7 @@ class SurfaceIndex:
             hinge_rad: (frame,) for a hinged object, else None.
             threshold_m: exclusive.
 
-        Returns:
-            (frame, position) bool.
+        Returns (frame, position) bool.
         """
         within = np.zeros(positions_m.shape[:2], bool)
         for part, surface in self._surfaces.items():
@@ -160,10 +158,7 @@ class SurfaceIndex:
         """(frame, position) float64 penetration depth: the distance to the surface inside the solid, 0 outside.
 
         Inside means a positive winding number: a cavity is outside, and overlapping shells count as one solid. With two
-        parts, the larger depth counts. Arguments as in ``within``.
-
-        Raises:
-            BadInput: no part encloses a solid.
+        parts, the larger depth counts. Arguments as in ``within``. Raises BadInput: no part encloses a solid.
         """
         self.check_solid()
         depth = np.zeros(positions_m.shape[:2])
@@ -232,7 +227,7 @@ def nearer_of(first: SignedDistance, second: SignedDistance) -> SignedDistance:
 
 def _has_cut(model: ObjectModel, part: int) -> bool:
     """Whether triangles close the cut between the part and the other part."""
-    return len(model.closed_part(part)[1]) > len(model.faces_of(part))
+    return len(model.closed_parts[part][1]) > len(model.faces_of(part))
 
 
 def _note(model: ObjectModel, solids: dict[int, Solid | NoSolid]) -> str | None:

@@ -13,11 +13,11 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
-import trimesh
 from scipy.spatial.transform import Rotation
+from trimesh.creation import box, cylinder, icosphere
 
 from hoidata.errors import BadInput
-from hoidata.objects.mesh import LARGEST_MESH_BYTES, Mesh
+from hoidata.objects.mesh import LARGEST_MESH_BYTES, Mesh, joined
 from hoidata.objects.model import Hinge
 from hoidata.objects.ply import MOST_TRIANGLES
 
@@ -73,9 +73,8 @@ def read_urdf(path: Path, root: Path, moving: str, read_mesh: ReadMesh) -> UrdfO
         root: the folder that must contain all meshes; ``package://`` refers to it.
         moving: name of the joint that moves; "" if there is only one.
 
-    Raises:
-        BadInput: the file is not a URDF, names a mesh outside of ``root``, or has several movable joints without
-            one of the name ``moving``.
+    Raises BadInput: the file is not a URDF, names a mesh outside of ``root``, or has several movable joints without one
+    of the name ``moving``.
     """
     robot = _parse(path)
     joints = [_joint(path, element) for element in _limited(path, robot, "joint")]
@@ -94,7 +93,7 @@ def read_urdf(path: Path, root: Path, moving: str, read_mesh: ReadMesh) -> UrdfO
     notes = [f"no visual mesh, so collision meshes count: {', '.join(collision[:5])}"] if collision else []
     notes += _joint_notes(movable, chosen)
     moves = behind[chosen.name] if chosen else set()
-    parts = [_joined([mesh for link in links if (link in moves) == is_moving for mesh in pieces[link]])
+    parts = [joined([mesh for link in links if (link in moves) == is_moving for mesh in pieces[link]])
              for is_moving in (False, True)]  # fmt: skip
     if not len(parts[0].faces):
         got = "none" if not len(parts[1].faces) else f"all of it behind joint {chosen.name!r}" if chosen else "none"
@@ -104,7 +103,7 @@ def read_urdf(path: Path, root: Path, moving: str, read_mesh: ReadMesh) -> UrdfO
         return UrdfObject(parts[0], part, None, None, notes)
     hinge, limits, rest = _hinge(chosen, poses[chosen.child])
     moved_m = (hinge.turn(np.array([rest])) @ parts[1].vertices[None])[0]
-    mesh = _joined([parts[0], Mesh(moved_m, parts[1].faces)])
+    mesh = joined([parts[0], Mesh(moved_m, parts[1].faces)])
     return UrdfObject(mesh, part, hinge, limits, notes)
 
 
@@ -283,13 +282,8 @@ class _Meshes:
             raise BadInput(
                 f"{self.path}: {kind}", f"a {' and a '.join(sizes[kind])} above 0", f"{values}", "correct it"
             )
-        match kind:
-            case "box":
-                primitive = trimesh.creation.box(values)
-            case "cylinder":
-                primitive = trimesh.creation.cylinder(values[0], values[1])
-            case _:
-                primitive = trimesh.creation.icosphere(3, values[0])
+        create = {"box": box, "cylinder": lambda size: cylinder(*size), "sphere": lambda size: icosphere(3, *size)}
+        primitive = create[kind](values)
         return Mesh(np.asarray(primitive.vertices, np.float64), np.asarray(primitive.faces, np.int64))
 
     def _scaled(self, shape: Element) -> Mesh:
@@ -324,10 +318,3 @@ class _Meshes:
         if not existing:
             raise BadInput(label, f"a file in {self.root}", "no such file", "add it, or give the folder that has it")
         return existing[0]
-
-
-def _joined(meshes: list[Mesh]) -> Mesh:
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    vertices = np.concatenate([np.zeros((0, 3)), *(mesh.vertices for mesh in meshes)])
-    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
-    return Mesh(vertices, np.concatenate([np.zeros((0, 3), np.int64), *faces]))

@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 from hoidata.errors import BadInput
 from hoidata.geometry.rows import distinct_rows
 from hoidata.objects.glb import Glb, parse_glb
-from hoidata.objects.mesh import LARGEST_MESH_BYTES, Mesh, NamedPieces, checked_mesh, load_named_mesh
+from hoidata.objects.mesh import Mesh, NamedPieces, checked_mesh, load_named_mesh, read_mesh_bytes
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.stl import parse_stl
 from hoidata.objects.urdf import PARTNET_NAME, UrdfObject, find_urdf, read_urdf
@@ -160,10 +160,8 @@ def _clustered(model: ObjectModel, cells: int) -> ObjectModel:
 def read_mesh_file(path: Path) -> Mesh:
     """Read vertices and triangles of an OBJ, PLY, STL or GLB file, in the file's unit and axes.
 
-    Coinciding vertices of STL and GLB are merged. The nodes of a GLB are in the frame of its scene.
-
-    Raises:
-        BadInput: the file holds no finite triangle mesh.
+    Coinciding vertices of STL and GLB are merged. The nodes of a GLB are in the frame of its scene. Raises BadInput:
+    the file holds no finite triangle mesh.
     """
     return _joined(_read(path))
 
@@ -183,11 +181,7 @@ def _read(path: Path) -> _MeshFile:
         return _MeshFile(mesh, None, pieces)
     if suffix not in (".stl", ".glb"):
         raise BadInput(path, "a mesh named .obj, .ply, .stl or .glb", path.suffix or "no suffix", "convert the mesh")
-    if not path.is_file():
-        raise BadInput(path, "a mesh file", "nothing there", "correct the path")
-    if path.stat().st_size > LARGEST_MESH_BYTES:
-        raise BadInput(path, f"at most {LARGEST_MESH_BYTES} bytes", f"{path.stat().st_size}", "decimate the mesh")
-    data = path.read_bytes()
+    data = read_mesh_bytes(path, "correct the path")
     mesh, pieces = _of_glb(parse_glb(data, path)) if suffix == ".glb" else _of_stl(path, data)
     checked_mesh(path, mesh)
     source = np.zeros(len(mesh.vertices), np.int64)
@@ -217,17 +211,12 @@ def _joined(file: _MeshFile) -> Mesh:
     return Mesh(file.mesh.vertices[used[first]], number[corner].reshape(-1, 3))
 
 
-def _in_two_pieces(path: Path, file: _MeshFile, moving: Sequence[str] = ()) -> tuple[Mesh, np.ndarray, tuple[str, str]]:
+def _in_two_pieces(path: Path, file: _MeshFile, moving: Sequence[str]) -> tuple[Mesh, np.ndarray, tuple[str, str]]:
     """Divide a mesh into two pieces, in the order of the file. Vertices that both pieces use are duplicated.
 
-    Args:
-        moving: names of the objects, groups or nodes that are the second piece; by default there must be two pieces.
-
-    Returns:
-        The mesh, (vertex,) 1 for vertices of the second piece, and the names of the pieces.
-
-    Raises:
-        BadInput: no division of the file has two pieces.
+    moving: names of the objects, groups or nodes that are the second piece; by default there must be two pieces.
+    Returns the mesh, (vertex,) 1 for vertices of the second piece, and the names of the pieces. Raises BadInput: no
+    division of the file has two pieces.
     """
     divisions = _divisions(file)
     pieces = _named_as_moving(path, file, moving) if moving else _division_into_two(divisions)
@@ -273,16 +262,14 @@ def _named_as_moving(path: Path, file: _MeshFile, moving: Sequence[str]) -> Name
 def piece_names(path: Path) -> tuple[str, str] | None:
     """Names of the two pieces of which ``--hinge`` rotates the second ("" if unnamed); None for any other mesh."""
     pieces = _division_into_two(_divisions(_read(path)))
-    return None if pieces is None else _names(pieces)
+    if pieces is None:
+        return None
+    first, second = _order(pieces)
+    return (pieces.names[first], pieces.names[second]) if pieces.names else ("", "")
 
 
 def _division_into_two(divisions: list[NamedPieces]) -> NamedPieces | None:
     return next((division for division in divisions if len(_order(division)) == 2), None)
-
-
-def _names(pieces: NamedPieces) -> tuple[str, str]:
-    first, second = _order(pieces)
-    return (pieces.names[first], pieces.names[second]) if pieces.names else ("", "")
 
 
 def _order(pieces: NamedPieces) -> list[int]:
@@ -317,7 +304,7 @@ def _scale(path: Path, mesh: Mesh, unit: str) -> float:
     if SMALLEST_M <= longest_m <= LARGEST_M:
         return UNITS_M[unit or "m"]
     likely = [
-        f"--unit {name} makes it {_centimetres(longest * factor)}"
+        f"--unit {name} makes it {longest * factor * 100:.3g} cm"
         for name, factor in UNITS_M.items()
         if name != (unit or "m") and GRASPABLE_M[0] <= longest * factor <= GRASPABLE_M[1]
     ]
@@ -325,10 +312,6 @@ def _scale(path: Path, mesh: Mesh, unit: str) -> float:
     raise BadInput(
         path, expected, f"{longest_m:.4g} m in {unit or 'm'}", "; ".join(likely) or "scale the mesh to metres"
     )
-
-
-def _centimetres(metres: float) -> str:
-    return f"{metres * 100:.3g} cm"
 
 
 def _upright_from_file(up: np.ndarray) -> np.ndarray:

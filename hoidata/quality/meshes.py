@@ -48,7 +48,7 @@ def surface_facts(vertices_m: np.ndarray, faces: np.ndarray) -> SurfaceFacts:
 
 def part_facts(model: ObjectModel) -> dict[int, SurfaceFacts]:
     """Measure each part, with the cut at the hinge closed. A rigid object has part 0 only."""
-    return {part: surface_facts(*model.closed_part(part)) for part in model.parts}
+    return {part: surface_facts(*mesh) for part, mesh in model.closed_parts.items()}
 
 
 def _open_edge_share(faces: np.ndarray) -> float:

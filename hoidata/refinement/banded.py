@@ -65,9 +65,8 @@ def acceleration_equations(
         difference: (frame, value) second differences, as from ``second_differences``.
         weight: (frame,) weight of each second difference, zero in the first two frames.
 
-    Returns:
-        Blocks [(frame, n, n), (frame - 1, n, n), (frame - 2, n, n)], block b of frame t at rows of frame t + b and
-        columns of frame t; and minus half the gradient (frame, n).
+    Returns blocks [(frame, n, n), (frame - 1, n, n), (frame - 2, n, n)], block b of frame t at rows of frame t + b and
+    columns of frame t; and minus half the gradient (frame, n).
     """
     n_frames, padded = len(weight), np.concatenate((weight, np.zeros(2)))
     transposed = derivative.swapaxes(1, 2)

@@ -19,7 +19,7 @@ from hoidata.objects.surface_index import surface_index
 from hoidata.physics.capsules import CapsuleContacts, Capsules, joined
 from hoidata.physics.realism import StandardUnits
 from hoidata.physics.scene import Scene, capsules_or_nan, object_scene
-from hoidata.refinement.grasp_solver import HandMotion
+from hoidata.refinement.grasp_solver import corrected_pose
 from hoidata.refinement.object_field import ObjectField, world_from_part
 from hoidata.refinement.skin import HandPose, SkinnedHand
 from hoidata.workers import one_thread
@@ -65,7 +65,7 @@ def _refined(pair: HandPair, clip: Clip, side: Side, other: Capsules | None) -> 
     if not grasps:
         return track
     part_from_world = world_from_grasped.inverse()
-    corrected = HandMotion(
+    corrected = corrected_pose(
         skin,
         ObjectField(_in_part(target, target.model.object_from_part(part, target.hinge_rad))),
         pose.relative_to(part_from_world),
@@ -74,7 +74,7 @@ def _refined(pair: HandPair, clip: Clip, side: Side, other: Capsules | None) -> 
         None if other is None else other.relative_to(part_from_world),
         part=part,
         passed=_passed(target, grasps),
-    ).corrected()
+    )
     refined = corrected.relative_to(world_from_grasped).track(track.mean_betas, track.valid, track.template_m)
     arrays = {
         name: (getattr(refined, name), getattr(track, name)) for name in ("wrist_m", "global_orient", "hand_pose")

@@ -47,11 +47,8 @@ def fit_hands(
         keypoint_ids: (keypoint,) vertices, the same on both sides.
         template_m: (2, 778, 3) personal rest meshes instead of the models' templates; not used if shapes are fitted.
 
-    Returns:
-        One track per side, valid in the frames that have the hand.
-
-    Raises:
-        BadInput: arrays of inconsistent shapes, or no frame with the hand.
+    Returns one track per side, valid in the frames that have the hand. Raises BadInput: arrays of inconsistent shapes,
+    or no frame with the hand.
     """
     tracks = {}
     for side, hand in generated.items():
@@ -184,9 +181,8 @@ def _equations(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Damped Gauss-Newton equations of each frame's pose.
 
-    Returns:
-        Derivatives (frame, 3 x keypoint, 51) and residuals (frame, 3 x keypoint, 1) of the keypoints; matrix
-        (frame, 51, 51) and minus half the gradient (frame, 51).
+    Returns derivatives (frame, 3 x keypoint, 51) and residuals (frame, 3 x keypoint, 1) of the keypoints; matrix
+    (frame, 51, 51) and minus half the gradient (frame, 51).
     """
     chain = skin.chain(pose, slopes=True)
     derivative = skin.all_derivatives(chain)

@@ -6,6 +6,7 @@ Levenberg-Marquardt.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -70,35 +71,25 @@ class EvaluatedPose(NamedTuple):
     other_slope: np.ndarray
 
 
+@dataclass
 class GraspObjective:
-    """Cost of a hand's pose in each frame, and its normal equations; everything in the frame of the part.
+    """Cost of a hand's pose in each frame, and its normal equations; everything in the frame of the part."""
 
-    Args:
-        original: (frame,) pose before the correction.
-        frames: (frame,) index of each frame in the object's motion.
-        in_grasp: (frame,) bool.
-        other: (frame,) capsules of the other hand, if any.
-        passed: (frame,) bool, the other part moves past the hand; None for never.
-    """
+    skin: SkinnedHand
+    field: ObjectField
+    original: HandPose  # (frame,) before the correction
+    frames: np.ndarray  # (frame,) index of each frame in the object's motion
+    in_grasp: np.ndarray  # (frame,) bool
+    other: Capsules | None  # (frame,) of the other hand
+    part: int
+    passed: np.ndarray | None  # (frame,) bool, the other part moves past the hand; None for never
 
-    def __init__(
-        self,
-        skin: SkinnedHand,
-        field: ObjectField,
-        original: HandPose,
-        frames: np.ndarray,
-        in_grasp: np.ndarray,
-        other: Capsules | None,
-        part: int = 0,
-        passed: np.ndarray | None = None,
-    ) -> None:
-        self.skin, self.field, self.original, self.frames = skin, field, original, frames
-        self.other, self.part, self.passed = other, part, passed
+    def __post_init__(self) -> None:
         self.metric = self._metric()
-        self.start = self.evaluate(np.zeros((len(frames), N_UNKNOWNS)))
-        near = np.maximum(skin.nearest_of_segments(self.start.grasped_m)[1], 0)
+        self.start = self.evaluate(np.zeros((len(self.frames), N_UNKNOWNS)))
+        near = np.maximum(self.skin.nearest_of_segments(self.start.grasped_m)[1], 0)
         # (frame, segment) how certain it is that the segment touches.
-        self.touch_weight = np.exp(-0.5 * (near / REACH_M) ** 2) * in_grasp[:, None]
+        self.touch_weight = np.exp(-0.5 * (near / REACH_M) ** 2) * self.in_grasp[:, None]
 
     def _metric(self) -> np.ndarray:
         """(frame, 51, 51) quadratic form of a step: squared vertex displacements in standard deviations."""
@@ -180,75 +171,50 @@ class GraspObjective:
         add_squares(frame, np.concatenate(slopes), derivative, weight, residual_m, matrix, vector)
 
 
-class HandMotion:
-    """A hand's motion and its spline correction; everything in the frame of the part.
+def corrected_pose(
+    skin: SkinnedHand,
+    field: ObjectField,
+    pose: HandPose,
+    grasps: Sequence[Interval],
+    valid: np.ndarray,
+    other: Capsules | None,
+    part: int,
+    passed: np.ndarray | None,
+) -> HandPose:
+    """The pose (frame,) of a hand after its spline correction, everything in the frame of the part.
 
-    The arguments that are not listed are as in ``GraspObjective``, for all frames.
-
-    Args:
-        pose: (frame,) original pose.
-        grasps: frame intervals in which the correction is constant.
-        valid: (frame,) bool, the hand is tracked.
+    The correction is constant in ``grasps``. valid: (frame,) bool, the hand is tracked. The other arguments are as in
+    ``GraspObjective``, for all frames.
     """
+    all_weights = spline_weights(len(valid), grasps)
+    frames, frame_weight, in_grasp = _representative_frames(grasps, valid)
+    weights, count = all_weights[frames], all_weights.shape[1]
+    bend = np.diff(np.eye(count), n=2, axis=0)
+    bend = bend.T @ bend / BEND_M**2  # of the control points' second differences
+    others, passing = None if other is None else other.taken(frames), None if passed is None else passed[frames]
+    objective = GraspObjective(skin, field, pose.taken(frames), frames, in_grasp, others, part, passing)
 
-    def __init__(
-        self,
-        skin: SkinnedHand,
-        field: ObjectField,
-        pose: HandPose,
-        grasps: Sequence[Interval],
-        valid: np.ndarray,
-        other: Capsules | None,
-        part: int = 0,
-        passed: np.ndarray | None = None,
-    ) -> None:
-        self.pose = pose
-        self.all_weights = spline_weights(len(valid), grasps)
-        frames, self.frame_weight, in_grasp = _representative_frames(grasps, valid)
-        self.weights = self.all_weights[frames]
-        bend = np.diff(np.eye(self.weights.shape[1]), n=2, axis=0)
-        self.bend = bend.T @ bend / BEND_M**2  # of the control points' second differences
-        self.objective = GraspObjective(
-            skin,
-            field,
-            pose.taken(frames),
-            frames,
-            in_grasp=in_grasp,
-            other=None if other is None else other.taken(frames),
-            part=part,
-            passed=None if passed is None else passed[frames],
-        )
+    def stepped(state: tuple[EvaluatedPose, np.ndarray], step: np.ndarray) -> tuple[EvaluatedPose, np.ndarray]:
+        points = state[1] + step
+        return objective.evaluate(weights @ points), points
 
-    def corrected(self) -> HandPose:
-        """The corrected pose of every frame."""
+    def cost(state: tuple[EvaluatedPose, np.ndarray]) -> float:
+        points_m = state[1] * _LEVER_M
+        return float(frame_weight @ objective.costs(state[0]) + (points_m * (bend @ points_m)).sum())
 
-        def stepped(state: tuple[EvaluatedPose, np.ndarray], step: np.ndarray) -> tuple[EvaluatedPose, np.ndarray]:
-            points = state[1] + step
-            return self.objective.evaluate(self.weights @ points), points
-
-        start = self.objective.start, np.zeros((self.weights.shape[1], N_UNKNOWNS))
-        _, control_points = minimize_banded(
-            start, self._cost, self._equations, stepped, max_steps=STEPS, min_gain=MIN_GAIN
-        )
-        return self.pose.moved(self.all_weights @ control_points)
-
-    def _cost(self, state: tuple[EvaluatedPose, np.ndarray]) -> float:
-        evaluated, control_points = state
-        points_m = control_points * _LEVER_M
-        bending = (points_m * (self.bend @ points_m)).sum()
-        return float(self.frame_weight @ self.objective.costs(evaluated) + bending)
-
-    def _equations(self, state: tuple[EvaluatedPose, np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
-        """Blocks and minus half the gradient, as ``solve_blocks`` takes them."""
-        evaluated, control_points = state
-        matrix, vector = self.objective.equations(evaluated)
-        matrix, blocks, count = matrix * self.frame_weight[:, None, None], [], self.weights.shape[1]
+    def equations(state: tuple[EvaluatedPose, np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
+        matrix, vector = objective.equations(state[0])
+        matrix, blocks = (matrix * frame_weight[:, None, None]).reshape(len(matrix), -1), []
         for offset in range(min(4, count)):
-            products = self.weights[:, : count - offset] * self.weights[:, offset:]
-            block = (products.T @ matrix.reshape(len(matrix), -1)).reshape(-1, N_UNKNOWNS, N_UNKNOWNS)
-            blocks.append(block + np.diagonal(self.bend, offset)[:, None, None] * np.diag(_LEVER_M**2))
-        gradient = self.weights.T @ (vector * self.frame_weight[:, None])
-        return blocks, gradient - self.bend @ control_points * _LEVER_M**2
+            products = weights[:, : count - offset] * weights[:, offset:]
+            block = (products.T @ matrix).reshape(-1, N_UNKNOWNS, N_UNKNOWNS)
+            blocks.append(block + np.diagonal(bend, offset)[:, None, None] * np.diag(_LEVER_M**2))
+        gradient = weights.T @ (vector * frame_weight[:, None])
+        return blocks, gradient - bend @ state[1] * _LEVER_M**2
+
+    start = objective.start, np.zeros((count, N_UNKNOWNS))
+    _, control_points = minimize_banded(start, cost, equations, stepped, max_steps=STEPS, min_gain=MIN_GAIN)
+    return pose.moved(all_weights @ control_points)
 
 
 def _representative_frames(grasps: Sequence[Interval], valid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -26,12 +26,8 @@ class ObjectField:
     def part_touched(self, points_m: np.ndarray, touching: np.ndarray) -> tuple[int, np.ndarray]:
         """The part that most points touch, and which points touch it.
 
-        Args:
-            points_m: (frame, point, 3) world.
-            touching: (frame, point) bool, whether a point touches the object.
-
-        Returns:
-            Index of the part, and (frame, point) bool, whether a point touches it.
+        points_m: (frame, point, 3) world. touching: (frame, point) bool, whether a point touches the object.
+        Returns the index of the part, and (frame, point) bool, whether a point touches it.
         """
         if len(self._parts) == 1:
             return 0, touching
@@ -47,8 +43,7 @@ class ObjectField:
             points_m: (frame, point, 3) world.
             frames: (frame,) index of each frame in the object's motion, all frames by default.
 
-        Returns:
-            Distances (frame, point), metres, and their gradients (frame, point, 3), world.
+        Returns distances (frame, point), metres, and their gradients (frame, point, 3), world.
         """
         return self._lowest(self._parts, points_m, frames)
 

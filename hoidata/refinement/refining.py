@@ -54,8 +54,7 @@ def refine_hands(
         tracks: the start, as returned by ``fit_hands``.
         object_track: the object's motion, with equally many frames.
 
-    Raises:
-        BadInput: arrays of inconsistent shapes or lengths.
+    Raises BadInput: arrays of inconsistent shapes or lengths.
     """
     field = ObjectField(object_track)
     refined = {}

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from hoidata.clips.clip import HandTrack, ObjectTrack
 from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.hands.kinematics import kinematics_of
 from hoidata.hands.model import HandPair, Side
-from hoidata.hands.tracks import kinematics_of
 from hoidata.refinement.fitting import GeneratedKeypoints, check_generated
 from hoidata.refinement.object_field import ObjectField, world_from_part
 

@@ -128,8 +128,7 @@ class SkinnedHand:
     def nearest_of_segments(self, distance_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """In each joint's skin the vertex with the smallest of the distances (frame, vertex).
 
-        Returns:
-            Its index (frame, 16) and its distance (frame, 16).
+        Returns its index (frame, 16) and its distance (frame, 16).
         """
         vertex = np.stack([ids[distance_m[:, ids].argmin(axis=1)] for ids in self._segments], 1)
         return vertex, np.take_along_axis(distance_m, vertex, 1)

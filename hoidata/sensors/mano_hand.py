@@ -10,7 +10,7 @@ from hoidata.hands import JOINT_NAMES, PARENTS, TIP_VERTICES, HandModel, HandPai
 from hoidata.hands.embedded import vertex_normals
 from hoidata.hands.model import N_ROTATIONS, Side
 from hoidata.hands.tracked_hand import JointCapsules, Skin, TrackedHand
-from hoidata.objects.farthest import farthest_points
+from hoidata.objects.sampling import farthest_points
 from hoidata.physics.mano_capsules import fit_capsules
 
 N_SENSORS = 104
@@ -28,8 +28,6 @@ def mano_hand(
     """A MANO-layout hand of one shape; its joints, tips and skin equal those of ``hoidata.hands.track_vertices``.
 
     Args:
-        hands: models of both sides.
-        side: which side.
         betas: (10,) shape coefficients, zeros by default.
         template_m: (778, 3) personal rest mesh instead of the model's template.
     """

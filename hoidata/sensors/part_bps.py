@@ -1,4 +1,4 @@
-"""BimArt's input features: part-wise basis point sets of an object and distance maps of hands (Zhang et al. 2024).
+"""BimArt's input features (Zhang et al. 2024): part-wise basis point sets, distance maps and keypoints of hands.
 
 A basis point set (Prokudin et al. 2019) encodes a shape by the vector from each of a few fixed points to the nearest
 point of the shape. BimArt encodes each part of an object separately (Sec. 3.1, Eq. 1-3).
@@ -20,8 +20,10 @@ from numba import njit
 from scipy.spatial import KDTree
 
 from hoidata.geometry.transform import IDENTITY, RigidTransform
+from hoidata.hands import HandModel
 from hoidata.objects.distance_grid import nearest_triangles
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.sampling import farthest_points
 from hoidata.objects.surface_index import PartSurface, surface_index
 
 Nearest = Literal["vertex", "surface"]
@@ -71,12 +73,9 @@ def canonical_object(model: ObjectModel, frame: CanonicalFrame = "axis") -> tupl
     """Move an object to its canonical frame.
 
     With a joint, z points against its axis. The origin is the point of a hinge axis nearest to the surface centre, and
-    the surface centre itself for a prismatic joint.
-    A hinge along -z through the origin is not moved (frame "axis"). A rigid object keeps its axes; its surface
-    centre becomes the origin.
-
-    Returns:
-        The object in the canonical frame, and ``object_from_canonical``.
+    the surface centre itself for a prismatic joint. A hinge along -z through the origin is not moved (frame "axis"). A
+    rigid object keeps its axes; its surface centre becomes the origin. Returns the object in the canonical frame, and
+    ``object_from_canonical``.
     """
     origin, rotation = _surface_centre_m(model.vertices_m, model.faces), np.eye(3)
     if model.hinge is not None:
@@ -210,9 +209,7 @@ class _PartVertices:
     def nearest(self, queries_m: np.ndarray, hinge_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nearest vertex index (frame, point) and its position (frame, point, 3), rest frame.
 
-        Args:
-            queries_m: (frame, point, 3) basis points, rotated back by the hinge angles.
-            hinge_rad: (frame,) hinge angles.
+        queries_m: (frame, point, 3) basis points, rotated back by the hinge angles. hinge_rad: (frame,) hinge angles.
         """
         arcs, vertex = np.floor(hinge_rad / ARC_RAD).astype(int), np.empty(queries_m.shape[:2], np.int32)
         for arc in np.unique(arcs).tolist():
@@ -292,8 +289,7 @@ def distance_map(points_m: np.ndarray, hand_m: np.ndarray) -> np.ndarray:
         points_m: (frame, point, 3) object points, in the same frame of reference as the hand.
         hand_m: (frame, hand point, 3).
 
-    Returns:
-        (frame, point) float32, metres.
+    Returns (frame, point) float32, metres.
     """
     points = np.ascontiguousarray(np.swapaxes(points_m, 1, 2), np.float32)
     return np.sqrt(_least_squared_distances(points, np.ascontiguousarray(hand_m, np.float32)))
@@ -326,3 +322,25 @@ def _least_squared_distances(points_m, hand_m):  # pragma: no cover (compiled)
                 a = a if a < c else c
                 best[point] = a if a < best[point] else best[point]
     return squares
+
+
+def hand_keypoints(model: HandModel, count: int) -> np.ndarray:
+    """Choose keypoints by farthest point sampling in each segment.
+
+    A segment is the vertices with the same joint of largest skin weight. Each segment gets at least one keypoint and
+    otherwise a number in proportion to its vertices (largest remainder method). Both sides use the same vertices.
+    Returns (count,) vertex indices, ascending.
+    """
+    segment = model.skin_weights.argmax(axis=1)
+    segments = [np.flatnonzero(segment == joint) for joint in np.unique(segment)]
+    sizes = np.array([len(vertices) for vertices in segments])
+    quotas = np.maximum(1, np.floor(count * sizes / sizes.sum())).astype(int)
+    while quotas.sum() != count:
+        remainder = np.where(quotas < sizes, count * sizes / sizes.sum() - quotas, -np.inf)
+        remainder = remainder if quotas.sum() < count else np.where(quotas > 1, -remainder, -np.inf)
+        quotas[remainder.argmax()] += 1 if quotas.sum() < count else -1
+    chosen = [
+        vertices[farthest_points(model.template_m[vertices], quota)]
+        for vertices, quota in zip(segments, quotas, strict=True)
+    ]
+    return np.sort(np.concatenate(chosen))

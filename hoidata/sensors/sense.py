@@ -1,7 +1,12 @@
-"""Readings of a hand's virtual sensors at an object (ManipNet, Sec. 5): 1,822 numbers per frame for ManipNet's hand."""
+"""Readings of a hand's virtual sensors at an object (ManipNet, Sec. 5): 1,822 numbers per frame for ManipNet's hand.
 
+The release also approximates the object: convex pieces instead of the mesh (one piece for cylinder, cube and cup),
+distances and normals interpolated from a grid. Those approximations are not reproduced.
+"""
+
+from dataclasses import dataclass, replace
 from functools import reduce
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -10,9 +15,32 @@ from hoidata.hands.tracked_hand import HandState, TrackedHand
 from hoidata.objects.distance import SignedDistance
 from hoidata.objects.rays import EITHER, ENTERING, LEAVING, first_hits, mark_cut_cubes
 from hoidata.objects.surface_index import ON_SURFACE_M, PartSurface, SurfaceIndex, nearer_of
-from hoidata.sensors.settings import CELLS, OURS, SensorSettings
 
+CELLS = 10  # along each axis of the ambient sensor
 _CHUNK_FRAMES = 128  # the ambient cells of 128 frames take 3 MB
+
+
+@dataclass(frozen=True)
+class SensorSettings:
+    """Sensor ranges and times; canonical axes: x to the fingers, y to the thumb, z out of the back of the hand."""
+
+    # When proximity and distance are measured, now first. The finger pose of now moves with the future wrist.
+    times_s: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
+    cell_m: float = 0.018  # edge of an ambient cell
+    # Centre of the ambient cube relative to the middle finger's knuckle, canonical axes.
+    ambient_offset_m: tuple[float, float, float] = (0.04, 0.0, -0.09)
+    ambient_turn: Literal["knuckle", "wrist"] = "knuckle"  # which joint the cells rotate with
+    reach_m: float = 0.1  # longest ray, largest distance
+    depth_m: float = 1.0  # largest depth; 1 m does not limit it
+    # A sensor inside the object casts its ray forward from a start behind the skin, or backward from the skin.
+    inside: Literal["forward", "backward"] = "forward"
+    behind_m: float = 0.02  # how far behind the skin a forward ray starts; the length of a backward ray
+    # A sensor this close counts as inside. It reads 0 if its ray hits nothing.
+    touching_m: float = 0.001
+
+
+OURS = SensorSettings()  # the definitions of the release
+PAPER = replace(OURS, ambient_turn="wrist", depth_m=0.1, inside="backward", behind_m=0.1, touching_m=0.0)
 
 
 class SensorReadings(NamedTuple):
@@ -49,34 +77,24 @@ def sense(
         object_from_wrist: (frame, time) transforms at ``settings.times_s``; the first time is now.
         hinge_rad: (frame, time) hinge angle of an articulated object, else None.
         surface: surface of the object (``hoidata.objects.surface_index.surface_index(model)``).
-        settings: sensor ranges and times.
     """
     chunks = []
     for start in range(0, len(state.joint_m), _CHUNK_FRAMES):
         frames = slice(start, start + _CHUNK_FRAMES)
-        parts = _parts(surface, object_from_wrist[frames], None if hinge_rad is None else hinge_rad[frames])
-        chunks.append(_sense(hand, state.taken(frames), parts, settings))
+        hinge = None if hinge_rad is None else hinge_rad[frames]
+        parts = [
+            _Part(part_surface, surface.model.object_from_part(part, hinge).inverse() @ object_from_wrist[frames])
+            for part, part_surface in surface.filled.items()
+        ]
+        pose = state.taken(frames)
+        ambient, proximity_m = _ambient(hand, pose, parts, settings), _proximity(pose, parts, settings)
+        chunks.append(SensorReadings(ambient, proximity_m, *_distances(hand, pose, parts, settings)))
     return SensorReadings(*(np.concatenate(column) for column in zip(*chunks, strict=True)))
 
 
 class _Part(NamedTuple):
     surface: PartSurface
     from_wrist: RigidTransform  # (frame, time) from the wrist's frame to the rest frame of the part
-
-
-def _parts(surface: SurfaceIndex, object_from_wrist: RigidTransform, hinge_rad: np.ndarray | None) -> list[_Part]:
-    model = surface.model
-    return [
-        _Part(part_surface, model.object_from_part(part, hinge_rad).inverse() @ object_from_wrist)
-        for part, part_surface in surface.filled.items()
-    ]
-
-
-def _sense(hand: TrackedHand, state: HandState, parts: list[_Part], settings: SensorSettings) -> SensorReadings:
-    distance_m, normal = _distances(hand, state, parts, settings)
-    return SensorReadings(
-        _ambient(hand, state, parts, settings), _proximity(state, parts, settings), distance_m, normal
-    )
 
 
 def _flat_points(points: np.ndarray) -> np.ndarray:
@@ -90,13 +108,10 @@ def _distances(
     """(frame, time, point) signed distances, and (frame, point, 3) gradients now."""
     points = state.point_m
     now = reduce(nearer_of, (_nearest_now(part, points) for part in parts))
-    later = reduce(np.minimum, (_signed_later(part, points, settings.reach_m) for part in parts))
+    later_m = ((part.surface, _flat_points(part.from_wrist[:, 1:] @ points[:, None])) for part in parts)
+    later = reduce(np.minimum, (surface.signed_m(point_m, settings.reach_m) for surface, point_m in later_m))
     distance_m = np.concatenate([now.distance_m[:, None], later.reshape(len(points), -1, points.shape[1])], axis=1)
     return np.clip(distance_m, -settings.depth_m, settings.reach_m), now.normal @ hand.wrist_from_canonical
-
-
-def _signed_later(part: _Part, points: np.ndarray, reach_m: float) -> np.ndarray:
-    return part.surface.signed_m(_flat_points(part.from_wrist[:, 1:] @ points[:, None]), reach_m)
 
 
 def _nearest_now(part: _Part, points: np.ndarray) -> SignedDistance:

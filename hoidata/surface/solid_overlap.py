@@ -27,8 +27,7 @@ class SolidOverlap:
     def __init__(self, index: SurfaceIndex, cell_m: float = CELL_M) -> None:
         """Intersect the object's parts with the lattice.
 
-        Raises:
-            BadInput: no part encloses a solid, or the lattice is too fine for the object's size.
+        Raises BadInput: no part encloses a solid, or the lattice is too fine for the object's size.
         """
         index.check_solid()
         self.index, self.cell_m = index, cell_m
@@ -42,8 +41,7 @@ class SolidOverlap:
             faces: (face, 3), outward by the right-hand rule.
             hinge_rad: (frame,) for a hinged object, else None.
 
-        Returns:
-            (frame,) cubic metres.
+        Returns (frame,) cubic metres.
         """
         volume = np.zeros(len(vertices_m))
         for part, lines in self._lines.items():

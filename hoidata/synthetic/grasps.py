@@ -17,7 +17,7 @@ from hoidata.clips.clip import HandType, Side
 from hoidata.errors import HoidataError
 from hoidata.geometry.rotations import mirror_rotvec_x, rotvec_to_rotmat
 from hoidata.hands import HandPair
-from hoidata.hands.tracks import kinematics_of
+from hoidata.hands.kinematics import kinematics_of
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.contact_forces import body_motion, hand_patches, patch_contacts, wrench_columns

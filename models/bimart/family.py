@@ -26,7 +26,7 @@ from models.bimart.sampler import BimArt, SampledMotion, SamplingTask, preset_of
 from models.bimart.scene import FeatureConfig, RecordedClip, Scene, recorded_clip
 from models.bimart.training import CONTACT, MOTION
 from models.common.checkpoints import load_checkpoint
-from models.common.family import Family, Figures, Skipped, Sources, motion_clip, refuse_not_finite
+from models.common.family import Family, Figures, ReportsContact, Skipped, Sources, motion_clip, refuse_not_finite
 
 NO_OBJECT_MOTION = "this method needs the motion of an object, and the request has none"
 NO_OTHER = {"other path": "no training clip of its object", "other object": "all training clips are of its object"}
@@ -49,7 +49,7 @@ class FamilyConfig:
 
 
 @dataclass(frozen=True)
-class BimArtSampler:
+class BimArtSampler(ReportsContact):
     """The trained networks of one dataset with their hand model, as a sampler of clips."""
 
     model: BimArt
@@ -78,9 +78,6 @@ class BimArtSampler:
             change=change,
             annotated=sources.annotated,
         )
-
-    def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
-        return self.sample_with_targets(requests)[0]
 
     def sample_with_targets(
         self, requests: Sequence[Request]

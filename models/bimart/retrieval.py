@@ -14,8 +14,7 @@ from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import HandPair
 from hoidata.refinement import GeneratedKeypoints, fit_hands, refine_hands
-from hoidata.sensors.keypoints import hand_keypoints
-from hoidata.sensors.part_bps import BasisSettings
+from hoidata.sensors.part_bps import BasisSettings, hand_keypoints
 from models.baselines.families import NO_MEAN
 from models.bimart.family import clip_without_hands, keypoints_in_world, training_clips, world_from_canonical
 from models.bimart.scene import FeatureConfig, RecordedClip, Scene, recorded_clip

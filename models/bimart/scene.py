@@ -24,10 +24,9 @@ from hoidata.clips.features import (
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rotvec
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import HandPair
-from hoidata.hands.tracks import kinematics_of
+from hoidata.hands.kinematics import kinematics_of
 from hoidata.objects.model import ObjectModel
-from hoidata.sensors.keypoints import hand_keypoints
-from hoidata.sensors.part_bps import BasisSettings, PartBps, canonical_object, distance_map
+from hoidata.sensors.part_bps import BasisSettings, PartBps, canonical_object, distance_map, hand_keypoints
 
 DOWN = np.array([0.0, 0.0, -1.0])  # the model frame is upright
 STATE_SIZES = {"pose": 6, "local": 9}

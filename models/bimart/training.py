@@ -12,7 +12,7 @@ from hoidata.devices import send
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotation_angle
 from hoidata.hands import HandPair
-from hoidata.sensors.keypoints import hand_keypoints
+from hoidata.sensors.part_bps import hand_keypoints
 from models.bimart.network import (
     ContactModel,
     Denoiser,

@@ -111,10 +111,7 @@ def batches(
 
 
 def _collated(
-    samples: list[ClipSample],
-    spec: BatchSpec,
-    seed: tuple[int, int, int],
-    augmentation: Augmentation,
+    samples: list[ClipSample], spec: BatchSpec, seed: tuple[int, int, int], augmentation: Augmentation
 ) -> ClipBatch:
     if augmentation.count:
         numbers = np.random.default_rng([*seed, 2]).integers(0, augmentation.count + 1, len(samples)).tolist()

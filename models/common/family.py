@@ -2,30 +2,24 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hoidata.batches.dataset import ClipBatch
+from hoidata.batches.dataset import ClipBatch, collate
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack
+from hoidata.clips.features import N_ROTATIONS, OBJECT_HINGE, OBJECT_POSITION, WRIST
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore
 from models.common.corpus import Corpus
-from models.common.features import (
-    Hands,
-    Normaliser,
-    hand_rotmats,
-    hand_wrist_m,
-    object_hinge_rad,
-    object_position_m,
-    object_rotmat,
-)
+from models.common.features import Hands, Normaliser, hand_rotmats, object_rotmat
 
 DOWN = np.array([0.0, 0.0, -1.0])
 Figures = dict[str, dict[str, float]]
@@ -51,6 +45,20 @@ class Objective(Protocol):
         Not called without validation clips (``Corpus.held_out``).
         """
         ...
+
+
+class ClipObjective:
+    """An objective that computes the losses of whole clips, without geometry."""
+
+    frames = entries = 0
+
+    def __init__(self, network: nn.Module, corpus: Corpus, device: torch.device) -> None:
+        self.network, self.corpus, self.device = network, corpus, device
+
+    @cached_property
+    def held_out(self) -> ClipBatch:
+        """The validation clips."""
+        return collate(self.corpus.held_out).to(self.device)
 
 
 @dataclass(frozen=True)
@@ -119,6 +127,18 @@ class Sampler(Protocol):
         ...
 
 
+@runtime_checkable
+class ReportsContact(Protocol):
+    """A sampler that conditions motions on contact and reports it."""
+
+    def sample(self, requests: Sequence[Request]) -> Sequence[Clip | Skipped]:
+        return self.sample_with_targets(requests)[0]
+
+    def sample_with_targets(self, requests: Sequence[Request]) -> tuple[Sequence[Clip | Skipped], Sequence[Any]]:
+        """The answers, with their conditions: (point,) bool touched points, ``TargetDistances`` to hands, or None."""
+        ...
+
+
 class SingleRequestSampler:
     """A sampler that answers requests one by one."""
 
@@ -149,16 +169,14 @@ def motion_clip(request: Request, hands: Tensor, objects: Tensor, synthetic: boo
 
     A hand that is not active is invalid in every frame. Raises BadInput if a number of an active hand or of the object
     is not finite.
-
-    Args:
-        synthetic: whether the model was trained on generated data.
+    synthetic: whether the model was trained on generated data.
     """
     refuse_not_finite(request, hands[torch.from_numpy(request.active_hands).to(hands.device)], objects)
     hands, objects = hands[:, : request.n_frames].cpu().double(), objects[: request.n_frames].cpu().double()
     rotation, origin = request.world_from_model[:3, :3], request.world_from_model[:3, 3]
     hinge = None
     if request.object.is_articulated:
-        hinge = object_hinge_rad(objects).float().numpy() * np.float32(request.object.joint_scale)
+        hinge = objects[..., OBJECT_HINGE].float().numpy() * np.float32(request.object.joint_scale)
     return Clip(
         clip_id=request.motion_id,
         dataset="generated",
@@ -171,7 +189,7 @@ def motion_clip(request: Request, hands: Tensor, objects: Tensor, synthetic: boo
         object=ObjectTrack(
             request.object,
             rotmat_to_rotvec(rotation @ object_rotmat(objects).numpy()).astype(np.float32),
-            (object_position_m(objects).numpy() @ rotation.T + origin).astype(np.float32),
+            (objects[..., OBJECT_POSITION].numpy() @ rotation.T + origin).astype(np.float32),
             hinge,
         ),
         source_frames=np.arange(request.n_frames, dtype=np.int32),
@@ -194,16 +212,13 @@ def refuse_not_finite(request: Request, *values: Tensor | np.ndarray) -> None:
 def _track(
     hand: Tensor, active: bool, request: Request, side: int, rotation: np.ndarray, origin: np.ndarray
 ) -> HandTrack:
-    n_frames = len(hand)
     template = None if request.template_m is None else request.template_m[side]
     betas = request.betas[side][None].astype(np.float32)
-    if not active:
-        zeros, valid = np.zeros((n_frames, 3), np.float32), np.zeros(n_frames, bool)
-        hand_pose = np.zeros((n_frames, 45), np.float32)
-        return HandTrack(zeros, zeros, hand_pose, betas=betas, valid=valid, template_m=template)
-    rotmats = hand_rotmats(hand).numpy()
-    rotmats[:, 0] = rotation @ rotmats[:, 0]
-    rotation_vectors = rotmat_to_rotvec(rotmats).astype(np.float32)
-    wrist = (hand_wrist_m(hand).numpy() @ rotation.T + origin).astype(np.float32)
-    hand_pose, valid = rotation_vectors[:, 1:].reshape(n_frames, 45), np.ones(n_frames, bool)
-    return HandTrack(wrist, rotation_vectors[:, 0], hand_pose, betas=betas, valid=valid, template_m=template)
+    wrist_m, rotvec = np.zeros((len(hand), 3), np.float32), np.zeros((len(hand), N_ROTATIONS, 3), np.float32)
+    if active:
+        rotmats = hand_rotmats(hand).numpy()
+        rotmats[:, 0] = rotation @ rotmats[:, 0]
+        rotvec = rotmat_to_rotvec(rotmats).astype(np.float32)
+        wrist_m = (hand[..., WRIST].numpy() @ rotation.T + origin).astype(np.float32)
+    hand_pose, valid = rotvec[:, 1:].reshape(-1, 45), np.full(len(hand), active)
+    return HandTrack(wrist_m, rotvec[:, 0], hand_pose, betas=betas, valid=valid, template_m=template)

@@ -46,29 +46,14 @@ def verb_one_hot(verbs: Sequence[str | None], known: Sequence[str], device: torc
     return send(torch.tensor([[float(verb == name) for name in known] for verb in verbs]), device)
 
 
-def hand_wrist_m(hands: Tensor) -> Tensor:
-    """Wrist positions (..., 3) of hand features (..., 99)."""
-    return hands[..., WRIST]
-
-
 def hand_rotmats(hands: Tensor) -> Tensor:
     """Local rotations (..., 16, 3, 3) of hand features (..., 99), the global one first."""
     return rot6d_to_rotmat(hands[..., HAND_ROTATIONS_6D].reshape(*hands.shape[:-1], N_ROTATIONS, 6))
 
 
-def object_position_m(objects: Tensor) -> Tensor:
-    """Positions (..., 3) of object features (..., 10)."""
-    return objects[..., OBJECT_POSITION]
-
-
 def object_rotmat(objects: Tensor) -> Tensor:
     """Rotations (..., 3, 3) of object features (..., 10)."""
     return rot6d_to_rotmat(objects[..., OBJECT_ROTATION_6D])
-
-
-def object_hinge_rad(objects: Tensor) -> Tensor:
-    """Hinge angles (...,) of object features (..., 10)."""
-    return objects[..., OBJECT_HINGE]
 
 
 def proper_hands(hands: Tensor) -> Tensor:
@@ -111,18 +96,18 @@ def recentred(hands: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
 
 def to_object_frame(points_m: Tensor, objects: Tensor) -> Tensor:
     """World points (..., point, 3) in the frame of the object (..., 10): ``R^T (p - t)``."""
-    return (points_m - object_position_m(objects)[..., None, :]) @ object_rotmat(objects)
+    return (points_m - objects[..., None, OBJECT_POSITION]) @ object_rotmat(objects)
 
 
 def hands_in_object_frame(hands: Tensor, objects: Tensor) -> Tensor:
     """Hand features (B, 2, F, 99) relative to the object (B, F, 10): wrist and global rotation change."""
-    rotation, position = object_rotmat(objects)[:, None], object_position_m(objects)[:, None]
+    rotation, position = object_rotmat(objects)[:, None], objects[:, None, :, OBJECT_POSITION]
     return _moved(hands, rotation.transpose(-1, -2), position)
 
 
 def hands_in_world(hands: Tensor, objects: Tensor) -> Tensor:
     """The inverse of :func:`hands_in_object_frame`."""
-    rotation, position = object_rotmat(objects)[:, None], object_position_m(objects)[:, None]
+    rotation, position = object_rotmat(objects)[:, None], objects[:, None, :, OBJECT_POSITION]
     inverse_origin = -(position[..., None, :] @ rotation)[..., 0, :]
     return _moved(hands, rotation, inverse_origin)
 
@@ -137,15 +122,15 @@ def _moved(hands: Tensor, rotation: Tensor, origin: Tensor) -> Tensor:
 
 def place_points(batch: RequestBatch, objects: Tensor) -> Tensor:
     """Object points (B, F, 1024, 3) at each pose (B, F, 10), with the moving part moved by its joint."""
-    hinge_rotmat = rotvec_to_rotmat(batch.hinge_axis[:, None] * object_hinge_rad(objects)[..., None])
+    hinge_rotmat = rotvec_to_rotmat(batch.hinge_axis[:, None] * objects[..., OBJECT_HINGE, None])
     origin = batch.hinge_origin_m[:, None, None]
-    slid_m = (batch.slide_m[:, None] * object_hinge_rad(objects)[..., None])[..., None, :]
+    slid_m = (batch.slide_m[:, None] * objects[..., OBJECT_HINGE, None])[..., None, :]
     still = batch.points_m[:, None].expand(-1, objects.shape[1], -1, -1)
     moved = (still - origin) @ hinge_rotmat.transpose(-1, -2) + origin + slid_m
     # Only part 1 of an articulated object moves with the hinge.
     moves = ((batch.part == 1) & batch.articulated[:, None])[:, None, :, None]
     articulated = torch.where(moves, moved, still)
-    return articulated @ object_rotmat(objects).transpose(-1, -2) + object_position_m(objects)[..., None, :]
+    return articulated @ object_rotmat(objects).transpose(-1, -2) + objects[..., None, OBJECT_POSITION]
 
 
 def turned_since_start(objects: Tensor) -> Tensor:
@@ -198,7 +183,7 @@ class Hands(nn.Module):
         n_frames = hands.shape[2]
         frame_betas = betas[:, side].repeat_interleave(n_frames, 0)
         template = None if template_m is None else template_m[:, side].repeat_interleave(n_frames, 0)
-        return hand_wrist_m(flat), hand_rotmats(flat), frame_betas, template
+        return flat[..., WRIST], hand_rotmats(flat), frame_betas, template
 
 
 @dataclass(frozen=True)

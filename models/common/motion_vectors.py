@@ -6,19 +6,18 @@ and T2M generate such vectors from the sentence, as Text2HOI adapted them: they 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from hoidata.batches.dataset import ClipBatch, collate
+from hoidata.batches.dataset import ClipBatch
 from hoidata.batches.requests import Request, RequestBatch, bucket_by_length, collate_requests
 from hoidata.clips.clip import Clip
 from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus
-from models.common.family import Losses, Network, Setup, motion_clip
+from models.common.family import ClipObjective, Losses, Network, Setup, motion_clip
 from models.common.features import Normaliser, proper_hands, proper_object, recentred
 from models.common.sampling import Motion
 
@@ -66,18 +65,12 @@ def vector_normaliser(corpus: Corpus) -> Normaliser:
     return Normaliser.of(clips)
 
 
-class VectorObjective:
+class VectorObjective(ClipObjective):
     """Objective of a network of motion vectors; subclasses define ``terms``."""
 
-    frames = entries = 0
-
     def __init__(self, network: nn.Module, setup: Setup, normaliser: Normaliser) -> None:
-        self.network, self.corpus, self.device = network.to(setup.device), setup.corpus, setup.device
+        super().__init__(network.to(setup.device), setup.corpus, setup.device)
         self.normaliser = normaliser.to(setup.device)
-
-    @cached_property
-    def held_out(self) -> ClipBatch:
-        return collate(self.corpus.held_out).to(self.device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         return self.terms(self.network, batch, generator)

@@ -38,13 +38,8 @@ def spread_out(points_m: Tensor, kinds: Tensor, count: int) -> tuple[Tensor, Ten
     """Farthest-point sampling (Eldar et al. 1997) among the points of each kind.
 
     The first point is the one farthest from the centre of its kind.
-
-    Args:
-        points_m: (B, N, 3).
-        kinds: (B, S, N) bool.
-
-    Returns:
-        Indices (B, S, count), and the mask (B, S, count) of those that exist.
+    points_m: (B, N, 3). kinds: (B, S, N) bool.
+    Returns indices (B, S, count), and the mask (B, S, count) of those that exist.
     """
     weight = kinds.to(points_m.dtype)
     centre = weight @ points_m / weight.sum(-1, keepdim=True).clamp_min(1)

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -33,7 +33,7 @@ from hoidata.settings import build_config, require_at_least
 from hoidata.store.annotated import WindowedStore, WindowProtocol, load_annotated
 from hoidata.store.store import open_store, write_store
 from models.common.checkpoints import FILE_NAME, empty_reason, write_empty
-from models.common.family import Family, Sampler, Skipped, Sources
+from models.common.family import Family, ReportsContact, Sampler, Skipped, Sources
 
 CLIPS_AT_ONCE = 32
 LEFT_OUT = "left_out.json"
@@ -52,21 +52,6 @@ class PredictionConfig:
     def __post_init__(self) -> None:
         require_at_least("sample", self, "samples", 1)
         require_at_least("sample", self, "clips", 0)
-
-
-# The contact that a motion was conditioned on: (point,) bool touched points, distances to the hands, or None.
-ContactCondition = np.ndarray | TargetDistances | None
-
-
-@runtime_checkable
-class ReportsContact(Protocol):
-    """A sampler that conditions motions on contact and reports it."""
-
-    def sample_with_targets(
-        self, requests: Sequence[Request]
-    ) -> tuple[Sequence[Clip | Skipped], Sequence[ContactCondition]]:
-        """As ``Sampler.sample``, with the contact that each motion was conditioned on (:data:`ContactCondition`)."""
-        ...
 
 
 def sample_family(
@@ -93,14 +78,12 @@ def sample_family(
     Args:
         annotated_root: folder with clips, annotation, contact and splits of a dataset.
         checkpoints: folder with one checkpoint folder per network.
-        params: a :class:`PredictionConfig`.
         settings: section of params.yaml by family.
         encoder: name of the text encoder, for families that read sentences; "": the one that the annotation names.
         progress: a folder for finished motions, from which an interrupted call continues with the same bytes; it is
             removed at the end. Delete it after a change of code or data.
 
-    Returns:
-        Counts of the store.
+    Returns counts of the store.
     """
     config = build_config(PredictionConfig, params, "params.yaml: sample")
     root, checkpoints = Path(annotated_root), Path(checkpoints)

@@ -6,7 +6,7 @@ import math
 import shutil
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
@@ -57,14 +57,13 @@ class State:
             "kept": self.ema_network.state_dict(),
             "best": self.best,
             "running": self.running,
-            "optimiser": {f"{number}.{name}": value for number, name, value in self._moments()},
+            "optimiser": {
+                f"{number}.{name}": value
+                for number, values in self.optimiser.state_dict()["state"].items()
+                for name, value in values.items()
+            },
         }
         return {f"{group}/{name}": value for group, named in groups.items() for name, value in named.items()}
-
-    def _moments(self) -> Iterator[tuple[int, str, Tensor]]:
-        for number, values in self.optimiser.state_dict()["state"].items():
-            for name, value in values.items():
-                yield number, name, value
 
     def restore(self, tensors: Mapping[str, Tensor], numbers: Mapping[str, Any]) -> None:
         """The inverse of ``tensors``; numbers: step, best_loss and log."""

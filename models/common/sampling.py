@@ -80,10 +80,7 @@ def draw_each(
     """Noise (B, 2, K, 99) and (B, L, object_features) with one generator per motion.
 
     Noise of the ``longest`` motion is generated and cut, so that it does not depend on the other motions of the batch.
-
-    Args:
-        longest: K and L of the longest possible motion.
-        sizes: K and L of this batch.
+    longest: K and L of the longest possible motion. sizes: K and L of this batch.
     """
     noise = [
         (

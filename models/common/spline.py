@@ -84,8 +84,7 @@ def _projection(n_frames: int, intervals: int) -> Tensor:
 def whiten(rows: Tensor, reach: float) -> Tensor:
     """Control points (..., L, 10 or 16) decorrelated by the smoothness prior; first-frame rotations are unchanged.
 
-    Args:
-        reach: correlation length of the prior, in control points.
+    reach: correlation length of the prior, in control points.
     """
     moved = rows[..., :OBJECT_FEATURES] - _as(UNMOVED, rows)
     # Multiplication by the inverse of the Cholesky factor decorrelates the control points.

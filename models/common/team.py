@@ -4,8 +4,6 @@ A step depends only on the number of micro-batches, so any number of processes g
 """
 
 import multiprocessing
-import os
-import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from multiprocessing.queues import SimpleQueue
@@ -17,6 +15,7 @@ from torch import Tensor
 from torch.multiprocessing.spawn import ProcessException, spawn
 
 from hoidata.errors import BadInput, HoidataError
+from hoidata.lifetime import end_with_starter
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ def run_team(work: Callable[..., None], size: int, meeting: Path, *arguments: ob
 def _member(
     rank: int, work: Callable[..., None], size: int, meeting: str, errors: SimpleQueue, arguments: tuple
 ) -> None:
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_starter()  # torch relies on SIGINT, which may be ignored
     dist.init_process_group("gloo", init_method=meeting, rank=rank, world_size=size)
     try:
         work(*arguments)
@@ -91,11 +90,3 @@ def _member(
         raise
     finally:
         dist.destroy_process_group()
-
-
-def _end_with_parent() -> None:
-    """End this process when its parent ends. Torch relies on SIGINT, which may be ignored."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)

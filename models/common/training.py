@@ -34,11 +34,13 @@ from models.common.checkpoints import (
 from models.common.corpus import BatchSpec, Corpus, batches
 from models.common.family import Network, Objective, Setup
 from models.common.features import Hands, Normaliser
-from models.common.precision import Precision, compute_in
+from models.common.point_net import PointNet
 from models.common.progress import LOG_NAME, WEIGHTS, Diverged, Line, Progress, Row, State, all_finite, write_log
 from models.common.repeatable import restored_rng, seeded_generator
 from models.common.team import Team
+from models.common.transformer import Encoder
 
+Precision = Literal["float32", "bfloat16"]
 # Subfolder of the progress folder with the last good checkpoint of a training that diverged.
 LAST_GOOD = "last_good"
 # Steps between two checks that losses are finite. On a GPU each check waits for the device.
@@ -139,11 +141,8 @@ def train_network(
         code: digest of the code; a training with other code, data or settings is not resumed.
         full_key: from a key of ``params``, such as ``training.learning_rate``, to the key that the user has to edit.
 
-    Returns:
-        The path of the file that was written.
-
-    Raises:
-        BadInput: a loss or a weight is not finite, or the settings are wrong.
+    Returns the path of the file that was written. Raises BadInput: a loss or a weight is not finite, or the settings
+    are wrong.
     """
     spec, needed, team = TrainingSpec.of(network, params), needed or {}, Team.joined()
     if missing := set(network.needs) - {other.name for other in needed}:
@@ -312,6 +311,25 @@ def fit(
     return state.ema_network, state.log
 
 
+def compute_in(network: nn.Module, precision: Precision) -> None:
+    """Make Transformers and point networks compute in ``precision`` (autocast). Weights and outputs stay float32."""
+    if precision == "float32":
+        return
+    for module in network.modules():
+        if isinstance(module, Encoder | PointNet):
+            lowered = _lowered(module.forward, getattr(torch, precision))
+            setattr(module, "forward", lowered)  # noqa: B010 (pyright knows forward as a method)
+
+
+def _lowered(forward: Any, dtype: torch.dtype) -> Any:
+    def lowered(x: Tensor, *arguments: Any) -> Any:
+        with torch.autocast(x.device.type, dtype):
+            outputs = forward(x, *arguments)
+        return outputs.float() if isinstance(outputs, Tensor) else tuple(output.float() for output in outputs)
+
+    return lowered
+
+
 def _parameter_groups(network: nn.Module) -> list[dict[str, Any]]:
     """Trainable parameters, with a factor of the learning rate for those that ``network.learning_rate_factors`` names.
 
@@ -341,8 +359,7 @@ def _add_gradients(
         parts: this process's micro-batches, with their numbers.
         numbers: seed, step, and the number of micro-batches of all processes.
 
-    Returns:
-        () the loss, equal in every process, on the device.
+    Returns () the loss, equal in every process, on the device.
     """
     seed, step, of = numbers
     buffers = list(state.network.buffers()) if of > 1 else []

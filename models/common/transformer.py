@@ -134,11 +134,8 @@ def packed(x: Tensor, attention_mask: Tensor) -> tuple[Tensor, Tensor, Tensor | 
     """Pack valid tokens at the front and cut the padding that all motions share.
 
     The order of tokens does not matter, because positions are encoded in them. On GPUs nothing is packed: reading the
-    number of tokens would wait for the device.
-
-    Returns:
-        Tokens, their mask, and indices (B, token) that restore the order; None if nothing was packed. Restored padding
-        has arbitrary values.
+    number of tokens would wait for the device. Returns tokens, their mask, and indices (B, token) that restore the
+    order; None if nothing was packed. Restored padding has arbitrary values.
     """
     longest = int(attention_mask.sum(1).max()) if x.device.type == "cpu" else x.shape[1]
     if longest == x.shape[1]:

@@ -9,8 +9,8 @@ import numpy as np
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
+from hoidata.hands.kinematics import track_rotmats
 from hoidata.hands.tracked_hand import TrackedHand
-from hoidata.hands.tracks import track_rotmats
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from models.manipnet.control import Control, Motion, interpolate_rotations

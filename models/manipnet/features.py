@@ -16,7 +16,7 @@ from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import HandState, TrackedHand
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.sensors import OURS, PAPER, SensorSettings, sense
-from hoidata.sensors.settings import CELLS
+from hoidata.sensors.sense import CELLS
 from models.manipnet.control import Control, Motion
 
 SAMPLE_NUMBERS = 16

@@ -76,9 +76,7 @@ class ContactModel(nn.Module):
         self.object_net = PointNet(3, config.point_net)
         self.contact_net = PointNet(4, config.point_net)
         self.to_latent = nn.Sequential(
-            PointLayer(overall, heads[0]),
-            PointLayer(heads[0], heads[1]),
-            nn.Linear(heads[1], 2 * config.latent),
+            PointLayer(overall, heads[0]), PointLayer(heads[0], heads[1]), nn.Linear(heads[1], 2 * config.latent)
         )
         first, second, third = config.decoder_widths
         # Table S6's first layer, split in two: the inputs per clip are equal at every point.
@@ -170,9 +168,7 @@ class AnchoredContact(nn.Module):
     def logits(self, cloud: EncodedPoints, anchors: Tensor, anchor_mask: Tensor) -> tuple[Tensor, Tensor]:
         """Logits of the next anchor and of the contact maps, (B, 2, N) each, by hand.
 
-        Args:
-            anchors: (B, 2, A, 3) normalised points.
-            anchor_mask: (B, 2, A) bool, the anchors given so far.
+        anchors: (B, 2, A, 3) normalised points. anchor_mask: (B, 2, A) bool, the anchors given so far.
         """
         points, local, clip, unit_m = cloud
         distance = torch.cdist(points[:, None], anchors).masked_fill(~anchor_mask[:, :, None], FAR)
@@ -198,9 +194,7 @@ class AnchoredContact(nn.Module):
 
         Anchors are sampled uniformly from touched points. The left hand's next anchor is predicted from a random number
         of its first ones, the right hand's also from all of the left hand's. A hand without contact has no anchors.
-
-        Args:
-            contact: (B, 2, N) float, recorded maps.
+        contact: (B, 2, N) float, recorded maps.
         """
         cloud = self.encode_points(batch.points_m, batch.scale_m, text, batch.active_hands)
         count, device = ANCHORS, contact.device
@@ -227,9 +221,7 @@ class AnchoredContact(nn.Module):
     def sample(self, batch: RequestBatch, text: Tensor, latents: Tensor) -> Tensor:
         """Contact probabilities (B, count, 2, N) by hand; a hand inactive in the whole batch costs nothing.
 
-        Args:
-            text: (B, 512) sentence features.
-            latents: (count, B, 2, A) uniform random numbers from 0 to 1.
+        text: (B, 512) sentence features. latents: (count, B, 2, A) uniform random numbers from 0 to 1.
         """
         points_m, active_hands = batch.points_m, batch.active_hands
         cloud, maps = self.encode_points(points_m, batch.scale_m, text, active_hands), []

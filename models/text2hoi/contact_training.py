@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -15,7 +14,7 @@ from hoidata.devices import send
 from models.common.augmentation import scaled_contact
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
-from models.common.family import Losses, Network, Objective, Setup
+from models.common.family import ClipObjective, Losses, Network, Objective, Setup
 from models.text2hoi.contact import (
     AnchoredContact,
     ContactConfig,
@@ -85,17 +84,12 @@ def _batch_and_latents(
 SampleContact = Callable[[RequestBatch, Tensor, torch.Generator | Sequence[torch.Generator]], Tensor]
 
 
-class ContactObjective:
+class ContactObjective(ClipObjective):
     """Losses of the contact network: Text2HOI, Sec. 3.1, or those of ``AnchoredContact``."""
 
-    frames = entries = 0
-
     def __init__(self, network: nn.Module, loss: ContactLossConfig, corpus: Corpus, device: torch.device) -> None:
-        self.network, self.loss, self.corpus, self.device = network, loss, corpus, device
-
-    @cached_property
-    def held_out(self) -> ClipBatch:
-        return collate(self.corpus.held_out).to(self.device)
+        super().__init__(network, corpus, device)
+        self.loss = loss
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         order = torch.randperm(batch.points_m.shape[1], generator=generator)[: self.loss.points]

@@ -10,7 +10,7 @@ A refined control is a perturbed recording after the refiner network (Text2HOI, 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 import torch
@@ -24,14 +24,14 @@ from hoidata.hands import HandPair
 from hoidata.refinement import refine_grasps
 from models.baselines.controls import NOISE, PRESSED, PerturbedRecording
 from models.baselines.retrieval import PROMPT_LOOKUP, VERB_LOOKUP
-from models.common.family import Family, Sampler, Skipped, Sources
+from models.common.family import Family, ReportsContact, Sampler, Skipped, Sources
 from models.text2hoi.family import NAMES, OtherPrompt, load_text2hoi, other_prompts
 from models.text2hoi.refiner import Surface
 from models.text2hoi.sampler import Text2Hoi
 
 
 @dataclass(frozen=True)
-class OtherContact:
+class OtherContact(ReportsContact):
     """Text2HOI conditioned on the recorded contact map of another clip with the same object.
 
     It reports the contact map of its sentence as the requested one, so it must lose in adherence.
@@ -39,9 +39,6 @@ class OtherContact:
 
     model: Text2Hoi
     others: dict[str, Tensor]  # contact maps by clip id; a clip without another one of its object is absent
-
-    def sample(self, requests: Sequence[Request]) -> Sequence[Clip | Skipped]:
-        return self.sample_with_targets(requests)[0]
 
     def sample_with_targets(self, requests: Sequence[Request]) -> tuple[Sequence[Clip | Skipped], list[np.ndarray]]:
         predicted = self.model.contact_maps(requests)
@@ -56,13 +53,10 @@ class OtherContact:
 
 
 @dataclass(frozen=True)
-class OwnContact:
+class OwnContact(ReportsContact):
     """Text2HOI conditioned on another clip's sentence, with the contact map of the original sentence."""
 
     other_prompt: OtherPrompt
-
-    def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
-        return self.sample_with_targets(requests)[0]
 
     def sample_with_targets(self, requests: Sequence[Request]) -> tuple[list[Clip | Skipped], list[np.ndarray | None]]:
         return self.other_prompt.sample_with_targets(requests, self.other_prompt.model.contact_maps(requests))
@@ -85,10 +79,7 @@ def _shared(one: ClipSample, other: ClipSample) -> float:
     return float((one.contact_map & other.contact_map).sum() / either) if either else 1.0
 
 
-def _family(name: str, title: str, load: Any) -> Family:
-    return Family(name, title, load, uses=NAMES)
-
-
+_family = partial(Family, uses=NAMES)
 ONE_CALL = _family(
     "one-call", "Text2HOI, one call of the denoiser", lambda sources: load_text2hoi(sources).with_sampler(steps=1)
 )

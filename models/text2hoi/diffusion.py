@@ -50,8 +50,7 @@ def contact_tokens(
         contact: (B, 2, N) bool, by hand.
         count: points of each of the three kinds.
 
-    Returns:
-        Features (B, 3 count, 13), and the mask (B, 3 count) of those filled: a kind may have fewer points.
+    Returns features (B, 3 count, 13), and the mask (B, 3 count) of those filled: a kind may have fewer points.
     """
     normalised, _ = normalised_points(points_m)
     kinds = torch.cat((contact, ~contact.any(1, keepdim=True)), 1)
@@ -263,9 +262,7 @@ class MotionGenerator:
     ) -> Motion:
         """Hands (B, 2, F, 99) and object (B, F, 10) in the model frame; the object starts at the origin.
 
-        Args:
-            noise: (B, 2, K, 99) and (B, L, 10 or 16).
-            generator: of the noise that DDPM adds.
+        noise: (B, 2, K, 99) and (B, L, 10 or 16). generator: of the noise that DDPM adds.
         """
         encoded, device = self.network.encode_condition(condition), condition.text.device
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Literal
 
 import torch
@@ -11,14 +10,14 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from hoidata.annotation.vocabulary import Vocabulary
-from hoidata.batches.dataset import ClipBatch, ClipSample, collate
+from hoidata.batches.dataset import ClipBatch, ClipSample
 from hoidata.clips.features import GLOBAL_ORIENT_6D
 from hoidata.devices import send
 from hoidata.geometry.rotations import rot6d_to_rotmat
 from models.common import losses
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
-from models.common.family import Losses, Network, Objective, Setup
+from models.common.family import ClipObjective, Losses, Network, Objective, Setup
 from models.common.features import Hands, Normaliser, object_rotmat, place_points, to_object_frame
 from models.common.sampling import TRAIN_STEPS, Motion, add_noise, alphas_cumprod
 from models.common.training_ranges import ranges_record
@@ -97,8 +96,10 @@ class Targets:
         return self._padded([tensor.transpose(0, axis) for tensor in tensors], 0).transpose(1, axis + 1)
 
 
-class DiffusionObjective:
+class DiffusionObjective(ClipObjective):
     """Losses of the diffusion network: Text2HOI, Eq. 4-7, and the terms that :class:`DiffusionLossConfig` adds."""
+
+    network: DiffusionModel
 
     def __init__(
         self,
@@ -111,7 +112,8 @@ class DiffusionObjective:
         sample_contact: SampleContact | None = None,
     ) -> None:
         """sample_contact: samples contact maps for a batch; if None, the recorded maps are the condition."""
-        self.network, self.weights, self.device, self.sample_contact = network, weights, device, sample_contact
+        super().__init__(network, corpus, device)
+        self.weights, self.sample_contact = weights, sample_contact
         self.hands, self.normaliser = hands.to(device), normaliser.to(device)
         self.signal = alphas_cumprod(device)
         self.frames, self.entries = weights.frames, DISTANCE_ENTRIES if weights.distance_weight > 0 else 0
@@ -119,11 +121,6 @@ class DiffusionObjective:
         is_normalised = network.config.signal_scale is not None
         scales = losses.feature_weights(is_normalised, device, network.representation.object_features)
         self.hand_weights, self.object_weights = (scale / network.signal_scale**2 for scale in scales)
-        self.corpus = corpus
-
-    @cached_property
-    def held_out(self) -> ClipBatch:
-        return collate(self.corpus.held_out).to(self.device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         weights, target = self.weights, self.targets.of(batch)

@@ -20,7 +20,7 @@ from hoidata.clips.clip import SIDES, Clip
 from hoidata.settings import build_config
 from models.baselines.contact_maps import mean_maps
 from models.common.checkpoints import load_checkpoint
-from models.common.family import Family, Figures, Skipped, Sources
+from models.common.family import Family, Figures, ReportsContact, Skipped, Sources
 from models.common.predicting import first_sentence
 from models.text2hoi.contact_training import (
     CONTACT,
@@ -109,14 +109,11 @@ def load_text2hoi(sources: Sources, **changes: Any) -> Text2Hoi:
 
 
 @dataclass(frozen=True)
-class OtherPrompt:
+class OtherPrompt(ReportsContact):
     """Text2HOI conditioned on another clip's sentence: a control for metrics that should depend on the sentence."""
 
     model: Text2Hoi
     other: dict[str, ClipSample]  # by clip id, the clip whose sentence to use; a clip that is absent is skipped
-
-    def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
-        return self.sample_with_targets(requests)[0]
 
     def sample_with_targets(
         self, requests: Sequence[Request], contact_maps: Sequence[Tensor] | None = None
@@ -162,7 +159,7 @@ def other_prompts(sources: Sources) -> dict[str, ClipSample]:
 
 
 @dataclass(frozen=True)
-class Estimated:
+class Estimated(ReportsContact):
     """Text2HOI with length and hand type estimated from the sentence, as in ``hoidata generate``.
 
     The sampler of ``Text2Hoi`` is given the recorded clip's; ``encoder`` is needed for the hand type.
@@ -177,9 +174,6 @@ class Estimated:
         encoder = load_encoder(sources.encoder or str(expected["name"]))
         refuse_other_encoder(sources.annotated.root, expected, encoder.identity)
         return cls(load_text2hoi(sources), encoder)
-
-    def sample(self, requests: Sequence[Request]) -> list[Clip]:
-        return self.sample_with_targets(requests)[0]
 
     def sample_with_targets(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
         return self.model.sample_with_targets([self.estimated(request) for request in requests])

@@ -6,17 +6,16 @@ the noise. ``sampled_from: gaussian`` predicts a mean and a standard deviation i
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from hoidata.annotation.vocabulary import Vocabulary
-from hoidata.batches.dataset import MAX_FRAMES, ClipBatch, collate
+from hoidata.batches.dataset import MAX_FRAMES, ClipBatch
 from hoidata.devices import send
-from models.common.corpus import Corpus, any_form
-from models.common.family import Losses, Network, Objective, Setup
+from models.common.corpus import any_form
+from models.common.family import ClipObjective, Losses, Network, Objective, Setup
 from models.common.features import TEXT_FEATURES, verb_one_hot
 
 SHORTEST_FRAMES = 8
@@ -101,17 +100,10 @@ def length_loss(mean: Tensor, log_spread: Tensor, frames: Tensor) -> dict[str, T
     return {"total": total, "square": square.mean(), "likelihood": likelihood.mean()}
 
 
-class LengthObjective:
+class LengthObjective(ClipObjective):
     """Loss of the length network: Text2HOI, Sec. 4.1, or a Gaussian likelihood."""
 
-    frames = entries = 0
-
-    def __init__(self, network: LengthModel, corpus: Corpus, device: torch.device) -> None:
-        self.network, self.corpus, self.device = network, corpus, device
-
-    @cached_property
-    def held_out(self) -> ClipBatch:
-        return collate(self.corpus.held_out).to(self.device)
+    network: LengthModel
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         noise = send(self.network.draw_noise(len(batch), generator), self.device)

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hoidata.batches.dataset import MAX_FRAMES, ClipSample
+from hoidata.batches.dataset import ClipSample
 from hoidata.clips.features import OBJECT_FEATURES
 from hoidata.devices import send
 from models.common.features import (
@@ -85,11 +85,6 @@ class MotionRepresentation:
         """Features of one control point of the object."""
         return OBJECT_START_6D.stop if self.config.object_rotation == "relative_to_start" else OBJECT_FEATURES
 
-    @property
-    def max_sizes(self) -> tuple[int, int]:
-        """Numbers of control points (K, L) of the longest motion."""
-        return self.sizes(MAX_FRAMES)
-
     def valid_masks(self, counts: Sequence[int], device: torch.device) -> tuple[Tensor, Tensor]:
         """Masks (B, K) and (B, L) of the control points that motions of these frame counts have."""
         sizes = np.array([self.sizes(n) for n in counts])
@@ -130,7 +125,8 @@ class MotionRepresentation:
         Hands (B, 2, F, 99) are in the configured frame, the object's position is its reference point, and 6D rotations
         are not orthonormal yet.
         """
-        objects, object_mask = self._unwhitened(objects), self.valid_masks(counts, objects.device)[1]
+        objects = unwhiten(objects, self._reach) if self.config.whitening_frames else objects
+        object_mask = self.valid_masks(counts, objects.device)[1]
         # Every control point repeats the first frame's rotation; the mean is the best estimate.
         start = mean_start(objects, object_mask) if self.config.object_rotation == "relative_to_start" else None
         if not self.config.knot_frames:
@@ -144,9 +140,6 @@ class MotionRepresentation:
 
     def _whitened(self, objects: Tensor) -> Tensor:
         return whiten(objects, self._reach) if self.config.whitening_frames else objects
-
-    def _unwhitened(self, objects: Tensor) -> Tensor:
-        return unwhiten(objects, self._reach) if self.config.whitening_frames else objects
 
     @property
     def _reach(self) -> float:

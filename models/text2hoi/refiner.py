@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from hoidata.batches.requests import RequestBatch
-from hoidata.clips.features import HAND_FEATURES, HAND_ROTATIONS_6D, WRIST
+from hoidata.clips.features import HAND_FEATURES, HAND_ROTATIONS_6D, OBJECT_HINGE, OBJECT_POSITION, WRIST
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import POINT_COUNT
 from hoidata.objects.signed_distance_grid import DistanceFields
@@ -26,8 +26,6 @@ from models.common.features import (
     Hands,
     hands_in_object_frame,
     hands_in_world,
-    object_hinge_rad,
-    object_position_m,
     object_rotmat,
     place_points,
     proper_hands,
@@ -146,7 +144,7 @@ class RefinerModel(nn.Module):
             distance = (coarse.distance_m / REACH_M).clamp(-2, 2)
             return torch.cat((*parts, attention_map(offset).flatten(-2), direction.flatten(-2) * 2, distance), -1)
         rotation_transposed = object_rotmat(coarse.object)[:, None].transpose(-1, -2)
-        joints = joints @ rotation_transposed + object_position_m(coarse.object)[:, None, :, None]
+        joints = joints @ rotation_transposed + coarse.object[..., OBJECT_POSITION][:, None, :, None]
         shape = (*local.shape[:-1], POINT_COUNT)
         norms = place_points(coarse.batch, coarse.object).norm(dim=-1)[:, None].expand(shape)
         contact_map = coarse.contact_map[:, None, None].expand(shape)
@@ -177,9 +175,7 @@ class Surface:
     ) -> CoarseMotion:
         """The refiner's input from generated hands (B, 2, F, 99) and objects (B, F, 10) in the model frame.
 
-        Args:
-            contact_map: (B, N), from 0 to 1.
-            present: (B, 2, F) bool, frames with each hand.
+        contact_map: (B, N), from 0 to 1. present: (B, 2, F) bool, frames with each hand.
         """
         joints = self.hands.joints(hands, batch.betas, batch.template_m)
         local, distance, offset = self.measure(batch, joints, objects)
@@ -197,17 +193,13 @@ class Surface:
     def measure(self, batch: RequestBatch, points_m: Tensor, objects: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Positions of hand points relative to the object.
 
-        Args:
-            points_m: (B, 2, F, P, 3) in the model frame.
-            objects: (B, F, 10).
-
-        Returns:
-            The points in the object's frame (B, 2, F, P, 3), their signed distance (B, 2, F, P) to its surface, and the
-            offset (B, 2, F, P, 3) to the nearest surface point, all in metres.
+        points_m: (B, 2, F, P, 3) in the model frame. objects: (B, F, 10).
+        Returns the points in the object's frame (B, 2, F, P, 3), their signed distance (B, 2, F, P) to its surface, and
+        the offset (B, 2, F, P, 3) to the nearest surface point, all in metres.
         """
         local = to_object_frame(points_m, objects[:, None])
         field_index = self.fields.rows([model.name for model in batch.objects])
-        hinge = object_hinge_rad(objects) * batch.articulated[:, None]
+        hinge = objects[..., OBJECT_HINGE] * batch.articulated[:, None]
         both_sides = local.transpose(1, 2).flatten(2, 3)
         distance, offset = self.fields.query(field_index, both_sides, hinge)
         shape = (len(local), local.shape[2], 2, local.shape[3])

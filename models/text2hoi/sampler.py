@@ -17,6 +17,7 @@ from hoidata.annotation.encoders import TextEncoder
 from hoidata.annotation.hand_choice import HandChoice, Method, choose_hand
 from hoidata.annotation.vocabulary import Vocabulary
 from hoidata.annotation.wording import parsed_verb
+from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import Request, RequestBatch, bucket_by_length, collate_requests
 from hoidata.clips.clip import Clip
 from hoidata.errors import BadInput
@@ -25,7 +26,7 @@ from hoidata.metrics.verb_ranges import ACCEPTED
 from hoidata.refinement import refine_grasps
 from hoidata.settings import require_at_least
 from models.common.checkpoints import FILE_NAME, Checkpoint, load_checkpoint
-from models.common.family import Network, motion_clip
+from models.common.family import Network, ReportsContact, motion_clip
 from models.common.features import Hands
 from models.common.sampling import TRAIN_STEPS, Motion, SamplerConfig, draw_each
 from models.common.training_ranges import verb_ranges
@@ -70,7 +71,7 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Text2Hoi:
+class Text2Hoi(ReportsContact):
     """The trained networks of one dataset, as a sampler."""
 
     trained: Mapping[str, Checkpoint]  # without those that are not used
@@ -141,9 +142,6 @@ class Text2Hoi:
         text = torch.from_numpy(request.text)[None].to(self.device)
         return int(network.sample(text, [self.verb_of(request)], generator))
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip]:
-        return self.sample_with_targets(requests)[0]
-
     def sample_with_targets(
         self, requests: Sequence[Request], contact_maps: Sequence[Tensor] | None = None
     ) -> tuple[list[Clip], list[np.ndarray]]:
@@ -167,8 +165,7 @@ class Text2Hoi:
     def candidates(self, requests: Sequence[Request], contact_maps: Sequence[Tensor] | None = None) -> list[Answer]:
         """One motion per request.
 
-        Args:
-            contact_maps: one per request, (2, N) by hand or (N,) for both, from 0 to 1, instead of sampled ones.
+        contact_maps: one per request, (2, N) by hand or (N,) for both, from 0 to 1, instead of sampled ones.
         """
         surface, answers = self.surface(requests), dict[int, Answer]()
         for numbers in bucket_by_length(requests):
@@ -202,16 +199,12 @@ class Text2Hoi:
         return contact_sampler(self.trained["contact"], is_binary, CONTACT_MAP_SAMPLES)(batch, batch.text, generators)
 
     def denoise(
-        self,
-        batch: RequestBatch,
-        verbs: Sequence[str | None],
-        contact: Tensor,
-        generators: list[torch.Generator],
+        self, batch: RequestBatch, verbs: Sequence[str | None], contact: Tensor, generators: list[torch.Generator]
     ) -> Motion:
         """Hands (B, 2, F, 99) and object (B, F, 10) in the model frame."""
         representation = self.generator.network.representation
         sizes = representation.sizes(batch.frames.shape[1])
-        noise = draw_each(representation.max_sizes, sizes, generators, representation.object_features)
+        noise = draw_each(representation.sizes(MAX_FRAMES), sizes, generators, representation.object_features)
         return self.generator.sample(Condition(batch, batch.text, verbs, contact), self.sampler, noise, generators)
 
     def refine(self, batch: RequestBatch, hands: Tensor, objects: Tensor, contact: Tensor, surface: Surface) -> Tensor:

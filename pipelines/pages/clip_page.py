@@ -12,7 +12,7 @@ from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.hands import HandPair
 from hoidata.objects.sampling import SampledPoints
 from hoidata.store.annotated import AnnotatedStore
-from hoidata.surface.bimart_maps import REACH_M, STEP_M, packed_map
+from hoidata.surface.measure import REACH_M, STEP_M, packed_map
 from pipelines.pages import clip_page_facts as content
 from pipelines.pages.clip_page_timeline import BOTH_COLOUR, SIDE_COLOURS, clip_charts, draw_timeline
 from pipelines.pages.examples import true_contact

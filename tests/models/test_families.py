@@ -23,8 +23,8 @@ from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
 from models.baselines.contact_maps import mean_map_by_position
 from models.baselines.retrieval import Retrieval
-from models.common.family import Sources, motion_clip
-from models.common.predicting import PredictionConfig, ReportsContact, requests_for, sample_family, spread
+from models.common.family import ReportsContact, Sources, motion_clip
+from models.common.predicting import PredictionConfig, requests_for, sample_family, spread
 from models.registry import family_names, load_family, load_network
 from models.text2hoi.contact_training import best_threshold, mean_f1
 from models.text2hoi.family import OtherPrompt, other_prompts

@@ -27,13 +27,12 @@ from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.annotated import AnnotatedStore
 from models.common.checkpoints import _config, load_checkpoint, save_checkpoint
 from models.common.corpus import Corpus, batches
-from models.common.object_frame import closed_as_stored
 from models.common.repeatable import make_repeatable
 from models.common.sampling import SamplerConfig
 from models.common.training import TrainingConfig, fit, learning_rate_factor, train_network
 from models.registry import load_network
 from models.text2hoi.diffusion import DiffusionModel, MotionGenerator
-from models.text2hoi.generation import GeneratedMotion, Generator, MotionOptions
+from models.text2hoi.generation import GeneratedMotion, Generator, MotionOptions, closed_as_stored
 from models.text2hoi.length import LengthModel
 from models.text2hoi.sampler import SamplingConfig
 from pipelines.generation import GenerationRequest, Models, generate_files

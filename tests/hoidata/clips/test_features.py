@@ -14,7 +14,7 @@ from hoidata.clips.recording import HandRecording, SourceHandTrack
 from hoidata.clips.slip import MOVING_CM_S, joint_slips_cm_s
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
-from hoidata.hands.tracks import track_rotmats
+from hoidata.hands.kinematics import track_rotmats
 from hoidata.sensors.mano_hand import mano_hand
 from tests.builders.clips import build_clip
 from tests.builders.objects import box_model

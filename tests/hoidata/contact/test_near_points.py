@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
 from hoidata.clips import ObjectTrack
-from hoidata.contact.near_points import ENTRY, near_entries, point_boxes
-from hoidata.contact.proximity import ProximityIndex
+from hoidata.contact.proximity import ENTRY, ProximityIndex, near_entries, point_boxes
 from hoidata.errors import BadInput
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.objects.sampling import SampledPoints

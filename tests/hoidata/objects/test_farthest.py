@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hoidata.objects.farthest import farthest_points
+from hoidata.objects.sampling import farthest_points
 
 
 def plain_loop(points: np.ndarray, count: int) -> list[int]:

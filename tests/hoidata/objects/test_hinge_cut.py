@@ -65,7 +65,7 @@ def test_a_cut_of_any_size_is_closed(model: ObjectModel) -> None:
         solid = model.solids[part]
         assert isinstance(solid, Solid)
         assert volume_m3(solid.vertices_m, solid.faces) == pytest.approx(volume)
-        assert is_closed(merged_surface(*model.closed_part(part)).faces)
+        assert is_closed(merged_surface(*model.closed_parts[part]).faces)
 
 
 def test_the_closing_triangles_affect_depths_but_not_distances() -> None:

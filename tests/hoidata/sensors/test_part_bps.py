@@ -10,13 +10,13 @@ from scipy.spatial import KDTree
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import Hinge, ObjectModel, articulate
-from hoidata.sensors.keypoints import hand_keypoints
 from hoidata.sensors.part_bps import (
     BasisSettings,
     Nearest,
     PartBps,
     canonical_object,
     distance_map,
+    hand_keypoints,
     object_scale,
 )
 from tests.builders.objects import box_model, model_of, two_parts

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from hoidata.clips import SIDES, Clip, ObjectTrack
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.sampling import sample_points
-from hoidata.surface.bimart_maps import BEYOND, REACH_M, STEP_M, bimart_map, packed_map
 from hoidata.surface.contact import HandInObjectFrame, hand_in_object_frame
+from hoidata.surface.measure import BEYOND, REACH_M, STEP_M, bimart_map, packed_map
 from tests.builders.clips import MIRROR, in_another_world, mirror_image, with_object
 
 POINTS = 200

@@ -10,9 +10,8 @@ from hoidata.clips import ObjectTrack
 from hoidata.hands import load_embedded_hands, track_joints, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import sample_points
-from hoidata.surface.bimart_maps import bimart_map
 from hoidata.surface.contact import hand_in_object_frame
-from hoidata.surface.measure import measure_hand
+from hoidata.surface.measure import bimart_map, measure_hand
 from tests.builders.clips import with_object
 
 POINTS = 128

@@ -12,8 +12,7 @@ from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
-from hoidata.sensors.keypoints import hand_keypoints
-from hoidata.sensors.part_bps import BasisSettings, distance_map
+from hoidata.sensors.part_bps import BasisSettings, distance_map, hand_keypoints
 from hoidata.store.annotated import AnnotatedStore
 from models.bimart.family import BIMART, OTHER_OBJECT, OTHER_PATH, UNREFINED, ZERO_MAP, BimArtSampler, mean_maps
 from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel

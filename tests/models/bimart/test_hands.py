@@ -17,8 +17,7 @@ from hoidata.metrics.verdict import verdict
 from hoidata.object_paths import ObjectPath, keyframed_path, parse_keyframes
 from hoidata.objects.model import articulate
 from hoidata.objects.surface_index import surface_index
-from hoidata.sensors.keypoints import hand_keypoints
-from hoidata.sensors.part_bps import BasisSettings
+from hoidata.sensors.part_bps import BasisSettings, hand_keypoints
 from models.bimart.family import BimArtSampler
 from models.bimart.hands import HandSamplingOptions, SampledHands, hands_for
 from models.bimart.network import ContactModel, DenoiserConfig, MotionModel

@@ -17,7 +17,7 @@ from hoidata.files import load_npy_object
 from hoidata.hands import HandPair, load_mano_hands, track_joints, track_vertices
 from hoidata.objects.sampling import sample_points
 from hoidata.refinement import GeneratedKeypoints, fit_hands
-from hoidata.sensors.keypoints import hand_keypoints
+from hoidata.sensors.part_bps import hand_keypoints
 from hoidata.store.hand_evidence import HandEvidence
 
 ROOT = Path(os.environ.get("HOIDATA_ARCTIC", ""))
