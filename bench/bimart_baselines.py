@@ -33,8 +33,8 @@ from hoidata.objects.model import articulate
 from hoidata.refinement import GeneratedKeypoints, fit_hands
 from hoidata.sensors.part_bps import BasisSettings, hand_keypoints
 from models.bimart.family import clip_without_hands, world_from_canonical
-from models.bimart.network import layout_of
-from models.bimart.retrieval import canonical_hands, moved_hands, scene_features
+from models.bimart.network import Layout
+from models.bimart.retrieval import moved_hands, scene_features
 from models.bimart.scene import Scene, hand_vertices_m
 from models.bimart.training import Moments
 from models.common.checkpoints import load_checkpoint
@@ -69,7 +69,7 @@ class CanonicalClip(NamedTuple):
 def canonical_clip(clip: ClipSample) -> CanonicalClip:
     scene = Scene.of(clip.object_model, clip.object, BASIS)
     joints_m = scene.model_from_canonical.inverse() @ clip.joints_m.astype(np.float64)
-    hands = canonical_hands(clip.hands, scene.model_from_canonical)
+    hands = moved_hands(clip.hands, scene.model_from_canonical.inverse())
     active = clip.valid & clip.active_hands[:, None]
     condition = condition_of(scene, clip.active_hands)
     return CanonicalClip(scene=scene, condition=condition, joints_m=joints_m, hands=hands, active=active)
@@ -130,7 +130,7 @@ class PoseNetwork(nn.Module):
     def sample_motion(self, condition: np.ndarray, seed: int) -> np.ndarray:
         """Sample a motion (frame, size) for a condition (frame, number) of any length."""
         device, generator = self.mean.device, torch.Generator().manual_seed(seed)
-        layout = layout_of(len(condition), self.config.window_frames, overlapping=True)
+        layout = Layout(len(condition), min(self.config.window_frames, len(condition)))
         windows = layout.cut(torch.from_numpy(condition.astype(np.float32))[None].to(device))
         frames = torch.ones(windows.shape[:2], dtype=torch.bool, device=device)
 

@@ -18,7 +18,7 @@ from hoidata.hands import HandPair
 from hoidata.hands.model import N_VERTICES
 from hoidata.metrics.target_contact import TargetDistances
 from hoidata.refinement import GeneratedKeypoints, fit_hands, refine_as_released, refine_hands
-from hoidata.sensors.part_bps import distance_map
+from hoidata.sensors.part_bps import BasisSettings, distance_map
 from hoidata.settings import build_config
 from hoidata.store.annotated import AnnotatedStore
 from models.bimart.network import MotionModel
@@ -69,40 +69,27 @@ class BimArtSampler(ReportsContact):
         preset: Preset = config.preset or preset_of(motion.network.config)
         sampling = sampling_of(preset, config.sampling, "params.yaml: sample.bimart.sampling")
         contact = load_checkpoint(sources.checkpoints / CONTACT.name, CONTACT, sources.device)
-        return cls(
-            model=BimArt.of(contact, motion, sampling, sources.device),
-            pair=sources.hands,
-            synthetic=bool(motion.facts["synthetic"]),
-            refinement=refinement or config.refinement or preset,
-            fits_shape=config.shape == "fitted",
-            change=change,
-            annotated=sources.annotated,
-        )
+        model, synthetic = BimArt.of(contact, motion, sampling, sources.device), bool(motion.facts["synthetic"])
+        refinement, fits_shape = refinement or config.refinement or preset, config.shape == "fitted"
+        return cls(model, sources.hands, synthetic, refinement, fits_shape, change, sources.annotated)
 
     def sample_with_targets(
         self, requests: Sequence[Request]
     ) -> tuple[list[Clip | Skipped], list[TargetDistances | None]]:
-        """Sample motions with their target contact maps.
+        """Sample a clip per request, and its target contact map: None for a motion of another path or object.
 
-        Returns:
-            One clip per request, and its target contact map. The map is None for a motion of another path or object.
-            A motion conditioned on the map of zeros is compared with the map that it would have had: no hand can
-            touch all object points.
+        A motion conditioned on the map of zeros is compared with the map that it would have had: no hand can touch all
+        object points.
         """
         motions: dict[int, SampledMotion] = {}  # by number of the request
         for batch in self._batches(requests):
             motions |= zip(batch, self.sample_motions([requests[number] for number in batch]), strict=True)
-        answers: list[Clip | Skipped] = [
-            self.clip(request, motions[number])
-            if number in motions
-            else Skipped(request.motion_id, self._why_not(request))
-            for number, request in enumerate(requests)
-        ]
+        answers, targets = list[Clip | Skipped](), list[TargetDistances | None]()
         has_target = self.change in ("none", "zero map")
-        targets = [
-            self.contact_target(request, motions[number]) if has_target and number in motions else None
-            for number, request in enumerate(requests)
-        ]
+        for number, request in enumerate(requests):
+            motion = motions.get(number)
+            answers.append(self.clip(request, motion) if motion else Skipped(request.motion_id, self._why_not(request)))
+            targets.append(self.contact_target(request, motion) if motion and has_target else None)
         return answers, targets
 
     def _batches(self, requests: Sequence[Request]) -> list[list[int]]:
@@ -137,16 +124,16 @@ class BimArtSampler(ReportsContact):
 
     def _scene(self, request: Request) -> Scene:
         """The request's scene, or the scene that a negative control uses instead."""
-        basis, object_features = self.model.motion.config.features.basis, _object_features(request)
+        basis = self.model.motion.config.features.basis
         if self.change in ("none", "zero map"):
-            return self._requested_scene(request)
+            return requested_scene(request, basis)
         others = self._others(request)
         other = others[request.seed % len(others)]
         if self.change == "other path":
             # The last frame of a shorter motion is repeated.
             rows = np.minimum(np.arange(request.n_frames), other.length - 1)
             return Scene.of(request.object, other.object[rows], basis)
-        return Scene.of(other.object_model, object_features, basis)
+        return Scene.of(other.object_model, requested_motion(request), basis)
 
     def contact_target(self, request: Request, motion: SampledMotion) -> TargetDistances:
         """The target contact map of a motion, object frame; NaN for inactive hands."""
@@ -160,7 +147,7 @@ class BimArtSampler(ReportsContact):
 
     def clip(self, request: Request, motion: SampledMotion) -> Clip:
         """Fit hands to the sampled keypoints, and refine them against the object."""
-        world = world_from_canonical(request, self._requested_scene(request))
+        world = world_from_canonical(request, requested_scene(request, self.model.motion.config.features.basis))
         hands = keypoints_in_world(request, world, motion.keypoints_m, motion.to_object_m)
         clip = clip_without_hands(request, self.synthetic)
         ids = self.model.motion.keypoint_ids.cpu().numpy()
@@ -170,14 +157,16 @@ class BimArtSampler(ReportsContact):
             tracks = refine(self.pair, ids, hands, tracks, clip.object)
         return replace(clip, hands={**clip.hands, **tracks})
 
-    def _requested_scene(self, request: Request) -> Scene:
-        return Scene.of(request.object, _object_features(request), self.model.motion.config.features.basis)
 
-
-def _object_features(request: Request) -> np.ndarray:
-    """(frame, 10) the object's motion of a request, model frame."""
+def requested_motion(request: Request) -> np.ndarray:
+    """(frame, 10) the object's motion of a request that has one, model frame."""
     assert request.trajectories is not None
     return request.trajectories.object[: request.n_frames]
+
+
+def requested_scene(request: Request, basis: BasisSettings) -> Scene:
+    """The object's motion of a request that has one, with its basis point set."""
+    return Scene.of(request.object, requested_motion(request), basis)
 
 
 @lru_cache(maxsize=2)
@@ -220,18 +209,15 @@ def clip_without_hands(request: Request, synthetic: bool) -> Clip:
     hands = torch.zeros(2, request.n_frames, HAND_FEATURES)
     # Identity rotations.
     hands[..., GLOBAL_ORIENT_6D.start :: 6] = hands[..., GLOBAL_ORIENT_6D.start + 3 :: 6] = 1
-    return motion_clip(request, hands, torch.from_numpy(_object_features(request)), synthetic)
+    return motion_clip(request, hands, torch.from_numpy(requested_motion(request)), synthetic)
 
 
 def diagnose(sources: Sources) -> Figures:
-    """Errors of both networks on at most ``DIAGNOSED_CLIPS`` test clips.
+    """Errors by network on at most ``DIAGNOSED_CLIPS`` test clips: mm, means over active hands, frames and points.
 
-    Returns:
-        Millimetres by network, means over active hands, frames and points.
-        bimart-contact: error of a sampled contact map, of the best of ten, and of the object's mean training map. A new
-        object has the mean map of all objects.
-        bimart-motion: error of the keypoints sampled for the recorded map, and the difference between their contact map
-        and that map.
+    bimart-contact: of a sampled contact map, of the best of ten, and of the object's mean training map; a new object
+    has the mean map of all objects. bimart-motion: of the keypoints sampled for the recorded map, and the difference
+    between their contact map and that map.
     """
     model = BimArtSampler.load(sources).model
     features = model.motion.config.features
@@ -253,9 +239,8 @@ def mean_maps(samples: Sequence[ClipSample], pair: HandPair, features: FeatureCo
     for sample in samples:
         clip = recorded_clip(sample, pair, features)
         mask = (clip.present & clip.active_hands[:, None])[..., None]
-        sum_and_count = np.stack(
-            ((clip.contact_m * mask).sum(axis=1, dtype=np.float64), mask.sum(axis=1) + 0 * clip.contact_m[:, 0])
-        )
+        total_m = (clip.contact_m * mask).sum(axis=1, dtype=np.float64)
+        sum_and_count = np.stack((total_m, np.broadcast_to(mask.sum(axis=1), total_m.shape)))
         for name in (sample.object_model.name, ""):
             totals[name] = totals.get(name, 0) + sum_and_count
     return {name: total[0] / total[1].clip(1) for name, total in totals.items()}
@@ -271,17 +256,13 @@ def _errors_mm(
     maps = model.sample_maps(tasks).reshape(DIAGNOSED_SAMPLES, len(clip.scene), 2, -1).transpose(0, 2, 1, 3)
     map_errors = [1000 * np.abs(one_map - recorded)[mask].mean() for one_map in maps]
     mean = means.get(sample.object_model.name, means[""])[:, None]
-    contact_m = torch.from_numpy(
-        np.where(clip.active_hands[:, None, None], recorded, 0).transpose(1, 0, 2).reshape(1, len(clip.scene), -1)
-    )
-    motion = model.sample_motions(tasks[:1], contact_m)[0]
+    contact_m = np.where(clip.active_hands[:, None, None], recorded, 0).transpose(1, 0, 2).reshape(len(clip.scene), -1)
+    motion = model.sample_motions(tasks[:1], torch.from_numpy(contact_m)[None])[0]
     has_hand = mask.any(axis=2)
     keypoints = 1000 * np.linalg.norm(motion.keypoints_m - clip.keypoints_m, axis=-1)[has_hand].mean()
     max_m = model.motion.config.features.max_distance_m or np.inf
-    keypoint_maps = np.stack(
-        [np.minimum(distance_map(clip.scene.object_point_m, hand), max_m) for hand in motion.keypoints_m]
-    )
-    difference = 1000 * np.abs(keypoint_maps - recorded)[mask].mean()
+    keypoint_maps = np.stack([distance_map(clip.scene.object_point_m, hand) for hand in motion.keypoints_m])
+    difference = 1000 * np.abs(np.minimum(keypoint_maps, max_m) - recorded)[mask].mean()
     mean_error = 1000 * np.abs(mean - recorded)[mask].mean()
     return float(np.mean(map_errors)), min(map_errors), mean_error, keypoints, difference
 

@@ -68,15 +68,10 @@ class SampledHands:
 def hands_for(
     sampler: BimArtSampler, object_track: ObjectTrack, options: HandSamplingOptions = HandSamplingOptions()
 ) -> list[SampledHands]:
-    """Sample motions of both hands, or one, for an object motion.
-
-    Raises:
-        BadInput: for an object motion of less than 8 frames.
-    """
+    """Sample motions of both hands, or one, for an object motion. Raises BadInput for less than 8 frames."""
     if object_track.n_frames < MIN_FRAMES:
-        raise BadInput(
-            "object motion", f"{MIN_FRAMES} frames or more", f"{object_track.n_frames}", "give a longer motion"
-        )
+        got = f"{object_track.n_frames}"
+        raise BadInput("object motion", f"{MIN_FRAMES} frames or more", got, "give a longer motion")
     points = sample_points(object_track.model)
     requests = [_request(object_track, options, points, number) for number in range(options.samples)]
     # One by one: the last bits of a matrix product depend on its number of rows.
@@ -129,18 +124,14 @@ def _sample_motion(
     sampler: BimArtSampler, object_track: ObjectTrack, request: Request, points: SampledPoints
 ) -> SampledHands:
     motion = sampler.sample_motions([request])[0]
-    unrefined_sampler = replace(sampler, refinement="none")
+    samplers = sampler, replace(sampler, refinement="none")
     # Features are float32: the clips get the given track instead of the one read from features.
-    refined_clip, unrefined_clip = (
-        replace(one_sampler.clip(request, motion), object=object_track) for one_sampler in (sampler, unrefined_sampler)
-    )
+    refined_clip, unrefined_clip = (replace(one.clip(request, motion), object=object_track) for one in samplers)
     points_world_m = object_track.points_in_world(points.points_m, points.part)
     distance_m = np.full((2, object_track.n_frames, len(points.points_m)), np.inf, np.float32)
     for side_index, side in enumerate(SIDES):
-        if refined_clip.hands[side].valid.any():
-            distance_m[side_index] = distance_map(
-                points_world_m, track_vertices(refined_clip.hands[side], sampler.pair[side])
-            )
+        if (track := refined_clip.hands[side]).valid.any():
+            distance_m[side_index] = distance_map(points_world_m, track_vertices(track, sampler.pair[side]))
     return SampledHands(
         clip=refined_clip,
         before=unrefined_clip,

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.nn.utils.rnn import pad_sequence
 
 from hoidata.devices import send
 from models.bimart.scene import FeatureConfig, Scene
@@ -55,9 +56,6 @@ class Windows:
     frame_mask: Tensor  # (B, F) bool, False for padding
     contact_m: Tensor | None = None  # (B, F, 2N) left then right; None for the contact model
 
-    def __len__(self) -> int:
-        return len(self.object_scale)
-
     def to(self, device: torch.device | str) -> Self:
         tensors = {name: send(value, device) for name, value in vars(self).items() if isinstance(value, Tensor)}
         return replace(self, **tensors)
@@ -76,23 +74,12 @@ class EncodedWindows:
     def doubled(self) -> "EncodedWindows":
         """All windows twice, first with and then without the contact map, both as ``conditional``."""
         both = torch.cat((self.conditional, self.unconditional))
-        masks = [torch.cat((mask, mask)) for mask in (self.attention_mask, self.channel_mask)]
-        return EncodedWindows(
-            conditional=both,
-            unconditional=both,
-            attention_mask=masks[0],
-            channel_mask=masks[1],
-            lengths=2 * self.lengths,
-        )
+        attention_mask, channel_mask = (torch.cat((mask, mask)) for mask in (self.attention_mask, self.channel_mask))
+        return EncodedWindows(both, both, attention_mask, channel_mask, 2 * self.lengths)
 
 
 class Denoiser(nn.Module):
-    """``clean = network(x, steps, windows)``.
-
-    Args:
-        size: D, numbers per frame.
-        with_contact: whether contact maps are part of the condition.
-    """
+    """``clean = network(x, steps, windows)`` of ``size`` numbers D per frame; contact maps are optional conditions."""
 
     input_mean: Tensor  # of O, G and scale
     input_scale: Tensor
@@ -134,15 +121,9 @@ class Denoiser(nn.Module):
         raise NotImplementedError
 
     def forward(self, x: Tensor, steps: Tensor, windows: Windows, drop: Tensor | None = None) -> Tensor:
-        """Predict the clean values.
+        """Predict clean from noised values (B, F, D), both normalised, at diffusion steps (B,) from 0 to 999.
 
-        Args:
-            x: (B, F, D) noised, normalised values.
-            steps: (B,) diffusion steps, 0 to 999.
-            drop: (B,) bool, windows whose contact map is dropped.
-
-        Returns:
-            (B, F, D) normalised.
+        drop: (B,) bool, windows whose contact map is dropped.
         """
         encoded = self.prepare(windows)
         tokens = encoded.conditional
@@ -152,33 +133,17 @@ class Denoiser(nn.Module):
 
     def prepare(self, windows: Windows) -> EncodedWindows:
         """Encode the condition: the part of ``forward`` that is the same at every diffusion step."""
-        frames_per_token, scene = self.config.transformer.frames_per_token, self._scene(windows)
-        frame_mask = windows.frame_mask[..., None]
+        frames_per_token, (scene, exists) = self.config.transformer.frames_per_token, scene_inputs(windows)
+        scene, frame_mask = (scene - self.input_mean) / self.input_scale * exists, windows.frame_mask[..., None]
         hands = 0.0 if self.hands_in is None else self.hands_in(windows.active_hands.float())[:, None]
         conditional, unconditional = (
             self.tokens_in(to_tokens(self._encode(scene, windows, with_map) * frame_mask, frames_per_token)) + hands
             for with_map in (True, False)
         )
-        token_mask = attention_mask_of(windows.frame_mask, frames_per_token)
         # A column for token 0, the diffusion step.
-        attention_mask = torch.cat((token_mask.new_ones(len(token_mask), 1), token_mask), 1)
-        return EncodedWindows(
-            conditional=conditional,
-            unconditional=unconditional,
-            attention_mask=attention_mask,
-            channel_mask=self.channel_mask(windows),
-            lengths=windows.frame_mask.sum(1).tolist() if self.config.knot_frames else [],
-        )
-
-    def _scene(self, windows: Windows) -> Tensor:
-        """(B, F, 3N + S + 1) normalised O, G and scale; zeros for a part that the object does not have."""
-        exists = windows.point_exists.repeat_interleave(3, 1)[:, None].expand_as(windows.basis_offset)
-        scale = windows.object_scale[:, None, None].expand(-1, windows.basis_offset.shape[1], 1)
-        scene = torch.cat((windows.basis_offset, windows.state, scale), -1)
-        scene = (scene - self.input_mean) / self.input_scale
-        # G and the scale always exist.
-        mask = torch.cat((exists, exists.new_ones(*exists.shape[:2], scene.shape[-1] - exists.shape[-1])), -1)
-        return scene * mask
+        attention_mask = functional.pad(attention_mask_of(windows.frame_mask, frames_per_token), (1, 0), value=True)
+        lengths = windows.frame_mask.sum(1).tolist() if self.config.knot_frames else []
+        return EncodedWindows(conditional, unconditional, attention_mask, self.channel_mask(windows), lengths)
 
     def _encode(self, scene: Tensor, windows: Windows, with_map: bool) -> Tensor:
         """(B, F, width) encoding of each frame's object, and of its contact map if ``with_map``."""
@@ -200,7 +165,9 @@ class Denoiser(nn.Module):
         # The embedding counts trained steps, which are spread over the 1,000.
         trained_step = (steps + 1) * config.diffusion_steps / TRAIN_STEPS - 1
         time = self.step_in(sinusoid(trained_step, width))[:, None]
-        x = x * self._noised_scale(steps) * encoded.channel_mask
+        signal = self.signal[steps][:, None, None]
+        # Noised values get standard deviation 1 (EDM's c_in).
+        x = x * (signal * config.signal_scale**2 + 1 - signal).rsqrt() * encoded.channel_mask
         frames = torch.cat((time, self.x_in(to_tokens(x, frames_per_token)) + tokens), 1)
         frames = self.drop(frames + sinusoid(torch.arange(frames.shape[1], device=x.device), width))
         hidden = self.encoder(frames, encoded.attention_mask)[:, 1:]
@@ -208,11 +175,6 @@ class Denoiser(nn.Module):
         if config.knot_frames:
             clean = projected(clean, encoded.lengths, config.knot_frames)
         return clean * encoded.channel_mask * config.signal_scale
-
-    def _noised_scale(self, steps: Tensor) -> Tensor:
-        """(B, 1, 1) factors that bring noised values to standard deviation 1 (EDM's c_in)."""
-        signal_fraction = self.signal[steps][:, None, None]
-        return (signal_fraction * self.config.signal_scale**2 + 1 - signal_fraction).rsqrt()
 
     def encode(self, values: Tensor) -> Tensor:
         """Normalise values (..., D) in metres."""
@@ -242,6 +204,14 @@ class MotionModel(Denoiser):
     def channel_mask(self, windows: Windows) -> Tensor:
         hands = self.config.features.spread_over_motion(windows.active_hands.bool())
         return hands[:, None] & windows.frame_mask[..., None]
+
+
+def scene_inputs(windows: Windows) -> tuple[Tensor, Tensor]:
+    """(B, F, 3N + S + 1) O, G and scale, and a bool mask: O of a part that the object does not have is missing."""
+    exists = windows.point_exists.repeat_interleave(3, 1)[:, None].expand_as(windows.basis_offset)
+    scale = windows.object_scale[:, None, None].expand(-1, windows.basis_offset.shape[1], 1)
+    scene = torch.cat((windows.basis_offset, windows.state, scale), -1)
+    return scene, functional.pad(exists, (0, scene.shape[-1] - exists.shape[-1]), value=True)
 
 
 def contact_channels(windows: Windows) -> Tensor:
@@ -291,11 +261,6 @@ class Layout:
         return (total / weight.clamp_min(1e-9))[:, : self.frames]
 
 
-def layout_of(frames: int, window_frames: int, overlapping: bool) -> Layout:
-    """Windows on a motion; a motion shorter than a window is one window of its length."""
-    return Layout(frames, min(window_frames, frames), overlapping)
-
-
 @dataclass(frozen=True)
 class SceneWindow:
     """Frames ``start`` to ``stop - 1`` of a scene."""
@@ -306,29 +271,20 @@ class SceneWindow:
     active_hands: np.ndarray  # (2,) bool
 
 
-def padded(windows: Sequence[np.ndarray], length: int) -> Tensor:
-    """(window, length, D) float32 rows of windows (frame, D), with zeros after their last frame."""
-    rows = [
-        np.concatenate((window, np.zeros((length - len(window), window.shape[1]), window.dtype))) for window in windows
-    ]
-    return torch.from_numpy(np.stack(rows).astype(np.float32))
+def padded(windows: Sequence[np.ndarray]) -> Tensor:
+    """(window, frame, ...) float32 of windows (frame, ...), with zeros after their last frame."""
+    return pad_sequence([torch.tensor(window, dtype=torch.float32) for window in windows], batch_first=True)
 
 
-def build_windows(scene_windows: Sequence[SceneWindow], length: int, config: DenoiserConfig) -> Windows:
-    """The condition of windows, padded to ``length`` frames, without contact maps."""
-    states, offsets, n_frames = [], [], []
-    for window in scene_windows:
-        start, stop = window.start, min(window.stop, len(window.scene))
-        states.append(window.scene.state(config.features.state, start, stop))
-        offsets.append(window.scene.basis_offset[start:stop].reshape(stop - start, -1))
-        n_frames.append(stop - start)
+def build_windows(scene_windows: Sequence[SceneWindow], config: DenoiserConfig) -> Windows:
+    """The condition of windows, padded to the longest, without contact maps."""
+    spans = [(window.scene, window.start, min(window.stop, len(window.scene))) for window in scene_windows]
     hands = [window.active_hands if config.condition_on_hands else np.ones(2, bool) for window in scene_windows]
-    scales = np.array([window.scene.object_scale for window in scene_windows], np.float32)
     return Windows(
-        basis_offset=padded(offsets, length),
-        state=padded(states, length),
-        object_scale=torch.from_numpy(scales),
-        point_exists=torch.from_numpy(np.stack([window.scene.point_exists for window in scene_windows])),
+        basis_offset=padded([scene.basis_offset[start:stop] for scene, start, stop in spans]).flatten(2),
+        state=padded([scene.state(config.features.state, start, stop) for scene, start, stop in spans]),
+        object_scale=torch.tensor([scene.object_scale for scene, _, _ in spans]),
+        point_exists=torch.from_numpy(np.stack([scene.point_exists for scene, _, _ in spans])),
         active_hands=torch.from_numpy(np.stack(hands)),
-        frame_mask=torch.from_numpy(np.arange(length) < np.array(n_frames)[:, None]),
+        frame_mask=padded([np.ones(stop - start) for _, start, stop in spans]).bool(),
     )

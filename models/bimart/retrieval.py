@@ -16,7 +16,14 @@ from hoidata.hands import HandPair
 from hoidata.refinement import GeneratedKeypoints, fit_hands, refine_hands
 from hoidata.sensors.part_bps import BasisSettings, hand_keypoints
 from models.baselines.families import NO_MEAN
-from models.bimart.family import clip_without_hands, keypoints_in_world, training_clips, world_from_canonical
+from models.bimart.family import (
+    clip_without_hands,
+    keypoints_in_world,
+    requested_motion,
+    requested_scene,
+    training_clips,
+    world_from_canonical,
+)
 from models.bimart.scene import FeatureConfig, RecordedClip, Scene, recorded_clip
 from models.common.family import Family, SingleRequestSampler, Skipped, Sources, motion_clip
 from models.common.features import proper_hands
@@ -29,11 +36,6 @@ STRIDE_FRAMES = 8
 # O, and G with the scale: both groups have the same weight in the distance between windows.
 FEATURE_GROUPS = (slice(0, 6 * BASIS.count), slice(6 * BASIS.count, None))
 ActiveHands = tuple[bool, bool]
-
-
-def canonical_hands(hands: np.ndarray, model_from_canonical: RigidTransform) -> np.ndarray:
-    """Transform hand features (side, frame, 99) from the model frame to the canonical frame."""
-    return moved_hands(hands, model_from_canonical.inverse())
 
 
 def moved_hands(hands: np.ndarray, transform: RigidTransform) -> np.ndarray:
@@ -83,7 +85,7 @@ class NearestWindow(SingleRequestSampler):
         for sample, scene, clip_features in zip(samples, scenes, by_clip, strict=True):
             if not sample.is_tracked:
                 continue
-            hands = canonical_hands(sample.hands, scene.model_from_canonical)
+            hands = moved_hands(sample.hands, scene.model_from_canonical.inverse())
             clip = TrainingClip((clip_features - mean) / std, hands, sample)
             clips.setdefault(active_hands_of(sample), []).append(clip)
         return cls(clips, mean, std, any(sample.synthetic for sample in samples))
@@ -91,12 +93,9 @@ class NearestWindow(SingleRequestSampler):
     def motion(self, request: Request) -> Clip | Skipped:
         if request.trajectories is None or active_hands_of(request) not in self.clips:
             return Skipped(request.motion_id, NO_WINDOW)
-        object_features = request.trajectories.object[: request.n_frames]
-        scene = Scene.of(request.object, object_features, BASIS)
-        clips = self.clips[active_hands_of(request)]
+        scene, clips = requested_scene(request, BASIS), self.clips[active_hands_of(request)]
         windows = [clips[number].hands[:, frames] for number, frames in self.windows(request, scene)]
-        hands = moved_hands(np.concatenate(windows, axis=1), scene.model_from_canonical)
-        return motion_clip(request, torch.from_numpy(hands), torch.from_numpy(object_features), self.synthetic)
+        return _clip(request, np.concatenate(windows, axis=1), scene, self.synthetic)
 
     def windows(self, request: Request, scene: Scene) -> list[tuple[int, np.ndarray]]:
         """For each window of a request: the number of the clip with the same hands, and its frames (frame,)."""
@@ -132,7 +131,7 @@ class MeanPose(SingleRequestSampler):
         samples = training_clips(sources.annotated)
         for sample in samples:
             scene = Scene.of(sample.object_model, sample.object, BASIS)
-            hands = canonical_hands(sample.hands, scene.model_from_canonical)
+            hands = moved_hands(sample.hands, scene.model_from_canonical.inverse())
             mask = (sample.valid & sample.active_hands[:, None])[..., None]
             total, count = total + (hands * mask).sum(axis=1), count + mask.sum(axis=1)
         hands = proper_hands(torch.from_numpy(total / count.clip(1))).numpy()
@@ -143,11 +142,14 @@ class MeanPose(SingleRequestSampler):
             return Skipped(request.motion_id, "no motion of an object")
         if (request.active_hands & ~self.in_training).any():
             return Skipped(request.motion_id, NO_MEAN)
-        object_features = request.trajectories.object[: request.n_frames]
-        scene = Scene.of(request.object, object_features, BASIS)
-        hands = np.repeat(self.hands[:, None], len(object_features), axis=1)
-        moved = torch.from_numpy(moved_hands(hands, scene.model_from_canonical))
-        return motion_clip(request, moved, torch.from_numpy(object_features), self.synthetic)
+        hands = np.repeat(self.hands[:, None], request.n_frames, axis=1)
+        return _clip(request, hands, requested_scene(request, BASIS), self.synthetic)
+
+
+def _clip(request: Request, hands: np.ndarray, scene: Scene, synthetic: bool) -> Clip:
+    """The requested clip with hand features (2, frame, 99), canonical frame."""
+    moved = moved_hands(hands, scene.model_from_canonical)
+    return motion_clip(request, torch.from_numpy(moved), torch.from_numpy(requested_motion(request)), synthetic)
 
 
 def active_hands_of(clip: Request | ClipSample) -> ActiveHands:
@@ -172,14 +174,12 @@ class RefinedWindow(SingleRequestSampler):
             return Skipped(request.motion_id, NO_WINDOW)
         hands, ids = self._hands(request), hand_keypoints(self.pair.right, FEATURES.keypoints)
         clip = clip_without_hands(request, self.nearest.synthetic)
-        tracks = fit_hands(self.pair, None, ids, hands)
-        tracks = refine_hands(self.pair, ids, hands, tracks, clip.object)
+        tracks = refine_hands(self.pair, ids, hands, fit_hands(self.pair, None, ids, hands), clip.object)
         return replace(clip, hands={**clip.hands, **tracks})
 
     def _hands(self, request: Request) -> dict[Side, GeneratedKeypoints]:
         """Keypoints and vectors to the object of the nearest windows, world frame."""
-        assert request.trajectories is not None
-        scene = Scene.of(request.object, request.trajectories.object[: request.n_frames], BASIS)
+        scene = requested_scene(request, BASIS)
         windows = [(self._recorded(request, number), frames) for number, frames in self.nearest.windows(request, scene)]
         keypoints = np.concatenate([clip.keypoints_m[:, frames] for clip, frames in windows], axis=1)
         to_object = np.concatenate([clip.to_object_m[:, frames] for clip, frames in windows], axis=1)

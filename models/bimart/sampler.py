@@ -5,7 +5,7 @@ Guidance moves the keypoints towards the contact map during sampling (Sec. 3.3, 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hoidata.devices import send
 from hoidata.errors import BadInput
-from hoidata.settings import build_config
+from hoidata.settings import build_config, merge_settings
 from models.bimart.network import (
     ContactModel,
     Denoiser,
@@ -23,9 +23,7 @@ from models.bimart.network import (
     Layout,
     MotionModel,
     SceneWindow,
-    Windows,
     build_windows,
-    layout_of,
 )
 from models.bimart.scene import Scene, split_motion
 from models.common.checkpoints import Checkpoint
@@ -42,9 +40,6 @@ class ContactTarget:
     object_point_m: Tensor  # (B, F, N, 3)
     contact_m: Tensor  # (B, F, 2N) target distances
     mask: Tensor  # (B, F, 2N) bool, distances that count
-
-
-Guide = Literal["off", "paper", "metres"]
 
 
 @dataclass(frozen=True)
@@ -76,13 +71,8 @@ def discrepancy(keypoints_m: Tensor, target: ContactTarget) -> Discrepancy:
 def paper_step(keypoints_m: Tensor, target: ContactTarget, scale: Tensor, window_frames: int) -> Tensor:
     """The guidance step of Eq. 6: the negative gradient of the mean squared error, scaled to length 1 per window.
 
-    Args:
-        keypoints_m: (B, F, 2, J, 3).
-        scale: (2, J, 3) metres per normalised unit.
-        window_frames: frames of a window; windows follow each other without overlap.
-
-    Returns:
-        (B, F, 2, J, 3) in normalised units.
+    keypoints_m (B, F, 2, J, 3); scale (2, J, 3), metres per normalised unit. The step is in normalised units. Windows
+    of ``window_frames`` follow each other without overlap.
     """
     current = discrepancy(keypoints_m, target)
     count = target.mask.unflatten(-1, (2, -1)).sum((1, 3), keepdim=True).clamp_min(1)
@@ -94,16 +84,10 @@ def paper_step(keypoints_m: Tensor, target: ContactTarget, scale: Tensor, window
 
 
 def metre_step(keypoints_m: Tensor, target: ContactTarget) -> Tensor:
-    """A guidance step in metres: Gauss-Newton with the diagonal of the Hessian.
+    """A guidance step of keypoints (B, F, 2, J, 3) in metres: Gauss-Newton with the diagonal of the Hessian.
 
     Each keypoint moves by the weighted mean of the corrections of the object points it is nearest to. Object points
     whose target distance is large have little weight.
-
-    Args:
-        keypoints_m: (B, F, 2, J, 3).
-
-    Returns:
-        (B, F, 2, J, 3) metres.
     """
     current = discrepancy(keypoints_m, target)
     mask = target.mask.unflatten(-1, (2, -1))
@@ -138,7 +122,7 @@ class SamplingConfig:
 
     sampler: BimArtSamplerConfig = field(default_factory=BimArtSamplerConfig)
     guidance_rule: Literal["usual", "paper"] = "usual"  # of classifier-free guidance, see ``combined``
-    contact_guidance: Guide = "metres"
+    contact_guidance: Literal["off", "paper", "metres"] = "metres"
     contact_guidance_fraction: float = 1 / 3  # contact guidance acts in this last fraction of the sampler's steps
     # True: windows overlap and are joined at each step. False (paper): windows are sampled independently.
     overlapping: bool = True
@@ -156,16 +140,8 @@ PRESETS = {"ours": OURS, "paper": PAPER}
 
 
 def sampling_of(preset: str, changes: Mapping[str, Any], source: str) -> SamplingConfig:
-    """The sampling of a preset with some settings changed; source: their section, for errors.
-
-    Raises:
-        BadInput: for an unknown key or a value of another type.
-    """
-    config = build_config(SamplingConfig, changes, source)
-    sampler_changes = {name: getattr(config.sampler, name) for name in changes.get("sampler", {})}
-    sampler = replace(PRESETS[preset].sampler, **sampler_changes)
-    others = {name: getattr(config, name) for name in changes if name != "sampler"}
-    return replace(PRESETS[preset], sampler=sampler, **others)
+    """The sampling of a preset with some settings changed; ``source``: their section, for BadInput."""
+    return build_config(SamplingConfig, merge_settings(asdict(PRESETS[preset]), changes), source)
 
 
 def preset_of(config: DenoiserConfig) -> Literal["ours", "paper"]:
@@ -202,11 +178,7 @@ class BimArt:
 
     @classmethod
     def of(cls, contact: Checkpoint, motion: Checkpoint, config: SamplingConfig, device: torch.device) -> "BimArt":
-        """Combine two checkpoints.
-
-        Raises:
-            BadInput: if the two networks have different features.
-        """
+        """Combine two checkpoints. Raises BadInput if the two networks have different features."""
         contact_model, motion_model = contact.network, motion.network
         assert isinstance(contact_model, ContactModel)
         assert isinstance(motion_model, MotionModel)
@@ -253,27 +225,21 @@ class BimArt:
     ) -> Tensor:
         """(B, frame, D) normalised values of a network, from noise."""
         frames, size = len(tasks[0].scene), len(network.mean)
-        layout = layout_of(frames, network.config.features.window_frames, self.config.overlapping)
-        encoded = network.prepare(self._windows(network, tasks, layout, contact_m))
-        noise = torch.stack([torch.randn(frames, size, generator=generator) for generator in generators])
-        noise = send(noise, self.device)
-        target, weight = None, 0.0
-        if contact_m is not None:
-            weight = self.config.sampler.guidance
-            target = None if self.config.contact_guidance == "off" else self._contact_target(tasks, contact_m)
-        denoise = self._denoiser(network, encoded, layout, weight, target)
-        return sample(denoise, noise, self.config.sampler, generators, network.config.noise_schedule)
-
-    def _windows(
-        self, network: Denoiser, tasks: Sequence[SamplingTask], layout: Layout, contact_m: Tensor | None
-    ) -> Windows:
+        # A motion shorter than a window is one window of its length.
+        layout = Layout(frames, min(network.config.features.window_frames, frames), self.config.overlapping)
         scene_windows = [
             SceneWindow(task.scene, start, start + layout.length, task.active_hands)
             for task in tasks
             for start in layout.starts
         ]
-        windows = build_windows(scene_windows, layout.length, network.config).to(self.device)
-        return windows if contact_m is None else replace(windows, contact_m=layout.cut(contact_m))
+        windows = build_windows(scene_windows, network.config).to(self.device)
+        target, weight = None, 0.0
+        if contact_m is not None:
+            windows, weight = replace(windows, contact_m=layout.cut(contact_m)), self.config.sampler.guidance
+            target = None if self.config.contact_guidance == "off" else self._contact_target(tasks, contact_m)
+        denoise = self._denoiser(network, network.prepare(windows), layout, weight, target)
+        noise = torch.stack([torch.randn(frames, size, generator=generator) for generator in generators])
+        return sample(denoise, send(noise, self.device), self.config.sampler, generators, network.config.noise_schedule)
 
     def _contact_target(self, tasks: Sequence[SamplingTask], contact_m: Tensor) -> ContactTarget:
         points = torch.from_numpy(np.stack([task.scene.object_point_m for task in tasks])).to(self.device)
@@ -285,24 +251,19 @@ class BimArt:
         self, network: Denoiser, encoded: EncodedWindows, layout: Layout, weight: float, target: ContactTarget | None
     ) -> Callable[[Tensor, Tensor], Tensor]:
         """A network with classifier-free guidance of some weight, and contact guidance if there is a target."""
-        config, calls, doubled = self.config, 0, encoded.doubled() if weight else encoded
+        config, calls, copies = self.config, 0, 2 if weight else 1
+        encoded = encoded.doubled() if weight else encoded
 
         def denoise(x: Tensor, steps: Tensor) -> Tensor:
             nonlocal calls
             calls += 1
-            windows, window_steps = layout.cut(x), steps.repeat_interleave(len(layout.starts))
-            if weight == 0:
-                clean = layout.joined(network.denoise(windows, window_steps, encoded, encoded.conditional))
-                unconditional = None
-            else:
-                both_windows, both_steps = torch.cat((windows, windows)), torch.cat((window_steps, window_steps))
-                both = network.denoise(both_windows, both_steps, doubled, doubled.conditional)
-                clean, unconditional = (layout.joined(half) for half in both.chunk(2))
+            windows = layout.cut(x).repeat(copies, 1, 1)
+            window_steps = steps.repeat_interleave(len(layout.starts)).repeat(copies)
+            denoised = network.denoise(windows, window_steps, encoded, encoded.conditional)
+            clean, *unconditional = (layout.joined(values) for values in denoised.chunk(copies))
             if target is not None and calls > config.sampler.steps * (1 - config.contact_guidance_fraction):
                 clean = self._guide_keypoints(clean, target)
-            if unconditional is None:
-                return clean
-            return combined(clean, unconditional, weight, config.guidance_rule)
+            return combined(clean, unconditional[0], weight, config.guidance_rule) if weight else clean
 
         return denoise
 

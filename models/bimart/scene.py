@@ -13,20 +13,14 @@ from cachetools import LRUCache, cached
 
 from hoidata.batches.dataset import ClipSample
 from hoidata.clips.clip import FPS, SIDES
-from hoidata.clips.features import (
-    HAND_ROTATIONS_6D,
-    N_ROTATIONS,
-    OBJECT_HINGE,
-    OBJECT_POSITION,
-    OBJECT_ROTATION_6D,
-    WRIST,
-)
+from hoidata.clips.features import OBJECT_HINGE, OBJECT_POSITION, OBJECT_ROTATION_6D, WRIST
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rotvec
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import HandPair
 from hoidata.hands.kinematics import kinematics_of
 from hoidata.objects.model import ObjectModel
 from hoidata.sensors.part_bps import BasisSettings, PartBps, canonical_object, distance_map, hand_keypoints
+from models.common.features import hand_rotmats
 
 DOWN = np.array([0.0, 0.0, -1.0])  # the model frame is upright
 STATE_SIZES = {"pose": 6, "local": 9}
@@ -92,22 +86,12 @@ class Scene:
         """Build from features (frame, 10) in the model frame (``hoidata.clips.features``)."""
         object_features = object_features.astype(np.float64)
         bps, object_from_canonical = _basis_structures(model, basis)
-        hinge_rad = np.zeros(len(object_features))
-        if model.is_articulated:
-            hinge_rad = object_features[:, OBJECT_HINGE] * model.joint_scale
+        hinge_rad = object_features[:, OBJECT_HINGE] * (model.joint_scale if model.is_articulated else 0)
         rotation = rot6d_to_rotmat(object_features[:, OBJECT_ROTATION_6D])
         model_from_object = RigidTransform(rotation, object_features[:, OBJECT_POSITION])
-        nearest = bps.nearest_points(hinge_rad)
-        return cls(
-            basis_offset=nearest.offset,
-            object_point_m=nearest.point_m,
-            point_exists=nearest.is_present,
-            object_scale=bps.scale,
-            hinge_rad=hinge_rad,
-            model_from_canonical=model_from_object @ object_from_canonical,
-            object_from_canonical=object_from_canonical,
-            bps=bps,
-        )
+        nearest, model_from_canonical = bps.nearest_points(hinge_rad), model_from_object @ object_from_canonical
+        points = nearest.offset, nearest.point_m, nearest.is_present
+        return cls(*points, bps.scale, hinge_rad, model_from_canonical, object_from_canonical, bps)
 
     def state(self, kind: str, start: int, stop: int) -> np.ndarray:
         """G (frame, 6 or 9) of frames ``start`` to ``stop - 1``; kind: ``FeatureConfig.state``."""
@@ -163,24 +147,17 @@ def recorded_clip(sample: ClipSample, pair: HandPair, config: FeatureConfig) -> 
         contact.append(np.minimum(distance_m, config.max_distance_m or np.inf).astype(np.float16))
         keypoints.append(keypoints_m.astype(np.float32))
         to_object.append((scene.bps.nearest_m(keypoints_m, scene.hinge_rad) - keypoints_m).astype(np.float32))
-    return RecordedClip(
-        scene=scene,
-        contact_m=np.stack(contact),
-        keypoints_m=np.stack(keypoints),
-        to_object_m=np.stack(to_object),
-        present=sample.valid,
-        active_hands=sample.active_hands,
-    )
+    contact_m, keypoints_m, to_object_m = map(np.stack, (contact, keypoints, to_object))
+    return RecordedClip(scene, contact_m, keypoints_m, to_object_m, sample.valid, sample.active_hands)
 
 
 @torch.no_grad()
 def hand_vertices_m(pair: HandPair, side: int, sample: ClipSample) -> np.ndarray:
     """(frame, 778, 3) float32 vertices of one hand, model frame; side: 0 left, 1 right."""
     hands = torch.from_numpy(sample.hands[side])
-    rotmats = rot6d_to_rotmat(hands[:, HAND_ROTATIONS_6D].reshape(-1, N_ROTATIONS, 6))
     template = None if sample.template_m is None else torch.from_numpy(sample.template_m[side])
-    layer = kinematics_of(pair[SIDES[side]])
-    return layer(hands[:, WRIST], rotmats, torch.from_numpy(sample.betas[side])[None], template)[0].numpy()
+    layer, betas = kinematics_of(pair[SIDES[side]]), torch.from_numpy(sample.betas[side])[None]
+    return layer(hands[:, WRIST], hand_rotmats(hands), betas, template)[0].numpy()
 
 
 def split_motion(motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,7 @@
 """Training of both networks: predict the clean values of noised windows of clips (Sec. 3.5)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from models.bimart.network import (
     build_windows,
     contact_channels,
     padded,
+    scene_inputs,
 )
 from models.bimart.scene import RecordedClip, recorded_clip
 from models.common.family import Losses, Network, Setup
@@ -57,7 +58,7 @@ class Targets:
     contact_mask: Tensor  # (B, F, 2N) bool, known contact distances
 
     def to(self, device: torch.device | str) -> "Targets":
-        windows, *tensors = (getattr(self, item.name) for item in fields(self))
+        windows, *tensors = vars(self).values()
         return Targets(windows.to(device), *(send(tensor, device) for tensor in tensors))
 
 
@@ -113,7 +114,9 @@ class Objective:
         self.clips = {clip_id: recorded_clip(train.whole(clip_id), pair, features) for clip_id in train.ids}
         self.starts = {clip_id: window_starts(clip, self.length) for clip_id, clip in self.clips.items()}
         network.keypoint_ids.copy_(torch.from_numpy(hand_keypoints(pair.right, features.keypoints)))
-        learn_statistics(network, self._training_windows())
+        # All windows of the training clips, thinned to those an eighth of a window apart.
+        starts = [(clip, self.starts[clip_id][:: max(self.length // 8, 1)]) for clip_id, clip in self.clips.items()]
+        learn_statistics(network, [(clip, int(start)) for clip, clip_starts in starts for start in clip_starts])
         self.network = network.to(setup.device)
         validation_clips = [recorded_clip(sample, pair, features) for sample in setup.corpus.held_out]
         windows = [(clip, start) for clip in validation_clips for start in middle_start(clip, self.length)]
@@ -149,11 +152,6 @@ class Objective:
         chosen = torch.randint(len(starts), (self.loss.windows_per_clip,), generator=generator).tolist()
         return [(self.clips[clip_id], int(starts[number])) for number in chosen]
 
-    def _training_windows(self) -> Sequence[ClipWindow]:
-        """All windows of the training clips, thinned to those an eighth of a window apart."""
-        stride = max(self.length // 8, 1)
-        return [(clip, int(start)) for clip_id, clip in self.clips.items() for start in self.starts[clip_id][::stride]]
-
 
 def window_losses(network: Denoiser, target: Targets, loss: LossConfig, generator: torch.Generator) -> Losses:
     """Noise windows to uniformly sampled steps and compare the prediction with the clean values (Sec. 3.5)."""
@@ -185,20 +183,15 @@ def targets_of(network: Denoiser, clip_windows: Sequence[ClipWindow]) -> Targets
     config = network.config
     length = max(min(config.features.window_frames, len(clip.scene) - start) for clip, start in clip_windows)
     scene_windows = [SceneWindow(clip.scene, start, start + length, clip.active_hands) for clip, start in clip_windows]
-    windows = build_windows(scene_windows, length, config)
-    clips = [clip for clip, _ in clip_windows]
-    frames = [slice(start, start + length) for _, start in clip_windows]
-    contact = [clip.contact_m[:, rows].transpose(1, 0, 2) for clip, rows in zip(clips, frames, strict=True)]
-    contact_m = padded([values.reshape(len(values), -1) for values in contact], length)
-    windows = replace(windows, contact_m=contact_m)
-    motion = [clip.motion[rows] for clip, rows in zip(clips, frames, strict=True)]
-    clean = contact_m if isinstance(network, ContactModel) else padded(motion, length)
-    present = padded([clip.present[:, rows].T for clip, rows in zip(clips, frames, strict=True)], length).bool()
+    cut = [(clip, slice(start, start + length)) for clip, start in clip_windows]
+    contact_m = padded([clip.contact_m[:, frames].transpose(1, 0, 2) for clip, frames in cut]).flatten(2)
+    windows = replace(build_windows(scene_windows, config), contact_m=contact_m)
+    present = padded([clip.present[:, frames].T for clip, frames in cut]).bool()
     contact_mask = present.repeat_interleave(config.features.object_points, 2) & contact_channels(windows)
-    clean_mask = contact_mask
-    if isinstance(network, MotionModel):
-        clean_mask = config.features.spread_over_motion(present) & network.channel_mask(windows)
-    return Targets(windows, clean, clean_mask, contact_mask)
+    if isinstance(network, ContactModel):
+        return Targets(windows, contact_m, contact_mask, contact_mask)
+    motion_mask = config.features.spread_over_motion(present) & network.channel_mask(windows)
+    return Targets(windows, padded([clip.motion[frames] for clip, frames in cut]), motion_mask, contact_mask)
 
 
 @torch.no_grad()
@@ -209,31 +202,21 @@ def learn_statistics(network: Denoiser, clip_windows: Sequence[ClipWindow], batc
     keypoints; vectors to the object; contact distances.
     """
     features = network.config.features
-    moments = {
-        "input": Moments(features.scene_size),
-        "": Moments(len(network.mean)),
-        "contact": Moments(features.contact_size),
-    }
-    for first in range(0, len(clip_windows), batch):
-        target = targets_of(network, clip_windows[first : first + batch])
-        windows = target.windows
-        assert windows.contact_m is not None
-        scale = windows.object_scale[:, None, None].expand(-1, windows.basis_offset.shape[1], 1)
-        frame_mask = windows.frame_mask[..., None]
-        exists = windows.point_exists.repeat_interleave(3, 1)[:, None] & frame_mask
-        state_mask = frame_mask.expand(-1, -1, windows.state.shape[-1] + 1)
-        scene = torch.cat((windows.basis_offset, windows.state, scale), -1)
-        moments["input"].add(scene, torch.cat((exists, state_mask), -1))
-        moments[""].add(target.clean, target.clean_mask)
-        moments["contact"].add(windows.contact_m, target.contact_mask)
-    offsets = 3 * features.object_points
+    offsets, keypoints = 3 * features.object_points, 6 * features.keypoints
     groups = {
         "input": [slice(0, offsets), *(slice(column, column + 1) for column in range(offsets, features.scene_size))],
-        "": [slice(None)],
+        "": [slice(0, keypoints), slice(keypoints, None)] if isinstance(network, MotionModel) else [slice(None)],
         "contact": [slice(None)],
     }
-    if isinstance(network, MotionModel):
-        groups[""] = [slice(0, 6 * features.keypoints), slice(6 * features.keypoints, None)]
+    sizes = features.scene_size, len(network.mean), features.contact_size
+    moments = {name: Moments(size) for name, size in zip(groups, sizes, strict=True)}
+    for first in range(0, len(clip_windows), batch):
+        target = targets_of(network, clip_windows[first : first + batch])
+        assert target.windows.contact_m is not None
+        scene, exists = scene_inputs(target.windows)
+        moments["input"].add(scene, exists & target.windows.frame_mask[..., None])
+        moments[""].add(target.clean, target.clean_mask)
+        moments["contact"].add(target.windows.contact_m, target.contact_mask)
     for name, sums in moments.items():
         mean, std = sums.mean_and_std()
         for group in groups[name]:

@@ -31,10 +31,9 @@ class AnimationInput(NamedTuple):
 
 
 def control_from_file(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, TrackedHand]) -> AnimationInput:
-    """Check the trajectories of a file with an object and convert them to a control signal.
+    """Convert the trajectories of a file with an object to a control signal.
 
-    Raises:
-        BadInput: if they are implausible; the remedy names the probable mistake, such as another unit.
+    Raises BadInput if they are implausible; the remedy names the probable mistake, such as another unit.
     """
     if model.is_articulated and file.hinge_rad is None:
         raise BadInput(file.source, "hinge_rad for a hinged object", "none", "add the column")
@@ -53,17 +52,13 @@ def control_from_file(file: TrajectoryFile, model: ObjectModel, hands: Mapping[S
 
 
 def at_30_fps(control: Control) -> Control:
-    """Resample trajectories at 30 fps from their first frame on.
-
-    Raises:
-        BadInput: for too many frames.
-    """
-    n_frames = int(np.floor((control.object_motion.time_s[-1] - control.object_motion.time_s[0]) * FPS + 1e-6)) + 1
+    """Resample trajectories at 30 fps from their first frame on. Raises BadInput for too many frames."""
+    first_s, last_s = control.object_motion.time_s[[0, -1]]
+    n_frames = int(np.floor((last_s - first_s) * FPS + 1e-6)) + 1
     if n_frames > MAX_FRAMES:
-        raise BadInput(
-            "time_s", f"at most {MAX_FRAMES} frames at {FPS} per second", f"{n_frames}", "cut it into pieces"
-        )
-    return control.at(control.object_motion.time_s[0] + np.arange(n_frames) / FPS)
+        expected = f"at most {MAX_FRAMES} frames at {FPS} per second"
+        raise BadInput("time_s", expected, f"{n_frames}", "cut it into pieces")
+    return control.at(first_s + np.arange(n_frames) / FPS)
 
 
 class Gap(NamedTuple):
@@ -91,16 +86,14 @@ def gap_of(track: HandTrack, frames: slice) -> Gap:
 
 
 def predict_fingers(predictor: Predictor, hand: TrackedHand, side: Side, control: Control, gap: Gap) -> np.ndarray:
-    """Predict finger rotations (frame, joint - 1, 3, 3) of a gap.
+    """Predict finger rotations (frame, joint - 1, 3, 3) of a gap, from the pose before it or the neutral pose on.
 
-    The prediction starts at the pose before the gap, or at the neutral pose. It is blended to the poses before and
-    after the gap over ``SEAM_S``.
+    The prediction is blended to the poses before and after the gap over ``SEAM_S``.
     """
     known_frames = int(gap.before is not None)
     start = hand.rest_rotmats if gap.before is None else gap.before
     time_s = control.object_motion.time_s[gap.first - known_frames : gap.stop]
-    task = RolloutTask(hand=hand, side=side, control=control, time_s=time_s, start=start)
-    (predicted,) = roll_out(predictor, [task])
+    (predicted,) = roll_out(predictor, [RolloutTask(hand, side, control, time_s, start)])
     return blend_ends(predicted[known_frames:], gap.before, gap.after, round(SEAM_S * FPS))
 
 
@@ -114,16 +107,9 @@ def interpolate_fingers(gap: Gap) -> np.ndarray:
 def blend_ends(
     predicted: np.ndarray, before: np.ndarray | None, after: np.ndarray | None, seam_frames: int
 ) -> np.ndarray:
-    """Blend predicted poses to the known poses before and after them.
+    """Blend predicted poses (frame, joint, 3, 3) over ``seam_frames`` to the known poses (joint, 3, 3) around them.
 
-    Args:
-        predicted: (frame, joint, 3, 3).
-        before: (joint, 3, 3) pose before the first frame, or None.
-        after: (joint, 3, 3) pose after the last frame, or None.
-        seam_frames: length of each blend.
-
-    Returns:
-        (frame, joint, 3, 3): near a known end, a blend of the prediction and the interpolation between both ends.
+    Near a known end, the result is a blend of the prediction and the interpolation between both ends.
     """
     first, last = (after if before is None else before), (before if after is None else after)
     if first is None or last is None:
@@ -142,11 +128,9 @@ def interpolated(before: np.ndarray, after: np.ndarray, count: int) -> np.ndarra
 
 
 def with_fingers(track: HandTrack, frames: slice, fingers: np.ndarray, wrist: Motion) -> HandTrack:
-    """Replace the finger poses of some frames, which become valid.
+    """Replace the finger poses (frame, 15, 3, 3) of some frames, which become valid.
 
-    Args:
-        fingers: (frame, 15, 3, 3).
-        wrist: the wrist of all frames; it replaces the track's wrist in untracked frames.
+    wrist: that of all frames; it replaces the track's wrist in untracked frames.
     """
     pose, valid = track.hand_pose.copy(), track.valid.copy()
     wrist_m, global_orient = track.wrist_m.copy(), track.global_orient.copy()
@@ -165,26 +149,21 @@ def clip_of(control: Control, fingers: Mapping[Side, np.ndarray], up: tuple[floa
     for side in SIDES:
         wrist, has_fingers = control.wrists[side].at(control.object_motion.time_s), side in fingers
         hand_pose = rotmat_to_rotvec(fingers[side]).reshape(n_frames, -1) if has_fingers else np.zeros((n_frames, 45))
-        tracks[side] = HandTrack(
-            wrist_m=wrist.translation.astype(np.float32),
-            global_orient=rotmat_to_rotvec(wrist.rotation).astype(np.float32),
-            hand_pose=hand_pose.astype(np.float32),
-            betas=np.zeros((1, 10), np.float32),
-            valid=np.full(n_frames, has_fingers),
+        wrist_m, orient, hand_pose = (
+            array.astype(np.float32) for array in (wrist.translation, rotmat_to_rotvec(wrist.rotation), hand_pose)
         )
-    object_track = ObjectTrack(
-        model=control.model,
-        rotvec=rotmat_to_rotvec(control.object_motion.rotmats).astype(np.float32),
-        translation_m=control.object_motion.position_m.astype(np.float32),
-        hinge_rad=None if control.hinge_rad is None else control.hinge_rad.astype(np.float32),
-    )
+        betas = np.zeros((1, 10), np.float32)
+        tracks[side] = HandTrack(wrist_m, orient, hand_pose, betas=betas, valid=np.full(n_frames, has_fingers))
+    rotvec, hinge_rad = rotmat_to_rotvec(control.object_motion.rotmats).astype(np.float32), control.hinge_rad
+    position_m = control.object_motion.position_m.astype(np.float32)
+    hinge_rad = None if hinge_rad is None else hinge_rad.astype(np.float32)
     return Clip(
         clip_id=f"animated/{name}",
         dataset="generated",
         subject="generated",
         sequence=name,
         hands=tracks,
-        object=object_track,
+        object=ObjectTrack(control.model, rotvec, position_m, hinge_rad),
         source_frames=np.arange(n_frames, dtype=np.int32),
         gravity=None if up is None else -np.asarray(up),
         gravity_note="" if up else "the file of trajectories does not state which axis is up",

@@ -119,25 +119,18 @@ def control_of(trajectories: Trajectories, model: ObjectModel) -> Control:
     time_s = np.arange(len(trajectories.object)) / FPS
     body_features = trajectories.object.astype(np.float64)
     hinge = body_features[:, OBJECT_HINGE] * model.joint_scale if model.is_articulated else None
-    wrists: dict[Side, Motion] = {
-        side: _wrist(trajectories, side_index, time_s) for side_index, side in enumerate(SIDES)
-    }
+    wrists: dict[Side, Motion] = {side: _wrist(trajectories, index, time_s) for index, side in enumerate(SIDES)}
     body = Motion(time_s, rot6d_to_rotmat(body_features[:, OBJECT_ROTATION_6D]), body_features[:, OBJECT_POSITION])
     return Control(wrists, body, model, hinge)
 
 
 def _wrist(trajectories: Trajectories, side_index: int, time_s: np.ndarray) -> Motion:
-    frames = nearest_tracked_frames(trajectories.valid[side_index])
-    if frames is None:
+    tracked = np.flatnonzero(trajectories.valid[side_index])
+    if not len(tracked):
         return untracked_wrist(time_s, trajectories.object[:, OBJECT_POSITION])
-    wrist = trajectories.wrists[side_index, frames].astype(np.float64)
+    nearest = tracked[abs(np.arange(len(time_s))[:, None] - tracked).argmin(axis=1)]
+    wrist = trajectories.wrists[side_index, nearest].astype(np.float64)
     return Motion(time_s, rot6d_to_rotmat(wrist[:, GLOBAL_ORIENT_6D]), wrist[:, WRIST])
-
-
-def nearest_tracked_frames(valid: np.ndarray) -> np.ndarray | None:
-    """(frame,) index of the nearest tracked frame; None if no frame is tracked."""
-    tracked = np.flatnonzero(valid)
-    return tracked[abs(np.arange(len(valid))[:, None] - tracked).argmin(axis=1)] if len(tracked) else None
 
 
 def untracked_wrist(time_s: np.ndarray, object_m: np.ndarray) -> Motion:
@@ -162,17 +155,13 @@ def trajectories_of(sample: ClipSample) -> Trajectories:
 
 def finger_rotmats_of(hand_features: np.ndarray) -> np.ndarray:
     """Finger rotations (frame, 15, 3, 3) of features (frame, 99)."""
-    rot6d = hand_features[:, HAND_POSE_6D].astype(np.float64).reshape(-1, N_ROTATIONS - 1, 6)
-    return rot6d_to_rotmat(rot6d)
+    return rot6d_to_rotmat(hand_features[:, HAND_POSE_6D].astype(np.float64).reshape(-1, N_ROTATIONS - 1, 6))
 
 
 def hands_of(pair: HandPair, betas: np.ndarray, template_m: np.ndarray | None) -> Mapping[Side, TrackedHand]:
     """Both hands of a person; betas: (2, 10); template_m: personal rest meshes (2, 778, 3) or None."""
     templates = [None, None] if template_m is None else [template.tobytes() for template in template_m]
-    return {
-        side: _tracked(pair, side, betas[side_index].tobytes(), templates[side_index])
-        for side_index, side in enumerate(SIDES)
-    }
+    return {side: _tracked(pair, side, betas[i].tobytes(), templates[i]) for i, side in enumerate(SIDES)}
 
 
 @lru_cache(maxsize=64)

@@ -6,7 +6,7 @@ With the paper's definitions: pose 198, input 2,356, output 220. Metres and righ
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from hoidata.clips.clip import FPS, SIDES, Side
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import HandState, TrackedHand
-from hoidata.objects.surface_index import SurfaceIndex
+from hoidata.objects.surface_index import surface_index
 from hoidata.sensors import OURS, PAPER, SensorSettings, sense
 from hoidata.sensors.sense import CELLS
 from models.manipnet.control import Control, Motion
@@ -56,24 +56,11 @@ class FeatureSettings:
         return np.arange(-past, future + 1) * self.spacing_s
 
 
-class HandInputs(NamedTuple):
-    """All inputs of one hand; sizes are those of ManipNet's hand."""
-
-    pose: np.ndarray  # (frame, 192)
-    trajectory: np.ndarray  # (frame, 336)
-    sensors: np.ndarray  # (frame, 1822)
-
-
 def pose_features(hand: TrackedHand, state: HandState, settings: FeatureSettings) -> np.ndarray:
-    """Pose of a hand as the network reads it.
+    """Pose (frame, 9 joints + 15 + 6 palm capsules) of a hand ``state (frame,)`` in its wrist's frame.
 
-    Args:
-        state: (frame,) the hand in its wrist's frame.
-
-    Returns:
-        (frame, 9 joints + 15 + 6 palm capsules), metres, canonical axes: joint positions, tips, starts and ends of the
-        palm's capsules, then z axis and y axis of each joint. Paper: (frame, 9 joints + 45), no capsules; the tips
-        have axes too, those of the finger's last joint.
+    Metres, canonical axes: joint positions, tips, starts and ends of the palm's capsules, then z axis and y axis of
+    each joint. Paper: (frame, 9 joints + 45), no capsules; the tips have axes too, those of the finger's last joint.
     """
     canonical, palm = hand.wrist_from_canonical, hand.palm_capsules
     positions_m, rotmats = [state.joint_m, state.tip_m], state.joint_rotmats
@@ -88,15 +75,9 @@ def pose_features(hand: TrackedHand, state: HandState, settings: FeatureSettings
 
 
 def joint_rotmats_of(hand: TrackedHand, pose: np.ndarray, settings: FeatureSettings) -> np.ndarray:
-    """Joint rotations from pose features or network output.
+    """(frame, joint, 3, 3) wrist_from_joint, from pose features or network output (frame, 192 or more).
 
     The predicted axes are orthonormalised by Gram-Schmidt, z first.
-
-    Args:
-        pose: (frame, 192 or more).
-
-    Returns:
-        (frame, joint, 3, 3) wrist_from_joint; ``hand.finger_rotmats`` converts them to local rotations.
     """
     first = _pose_counts(hand, settings)[0]
     axes = np.reshape(pose[:, first : first + 6 * hand.n_joints], (len(pose), hand.n_joints, 2, 3))
@@ -110,22 +91,18 @@ def joint_rotmats_of(hand: TrackedHand, pose: np.ndarray, settings: FeatureSetti
 def trajectory_features(
     control: Control, side: Side, hand: TrackedHand, time_s: np.ndarray, settings: FeatureSettings
 ) -> np.ndarray:
-    """Past and future trajectory of wrists and object around ``time_s (frame,)``.
+    """Past and future trajectory (frame, 21 x 16) of wrists and object around ``time_s (frame,)``.
 
-    Returns:
-        (frame, 21 x 16), metres, canonical axes of this hand's wrist at ``time_s``. Per sample: distance of the other
-        wrist; this wrist's position, z axis and y axis; the position of the object's box centre (paper: centre of
-        mass), and its angular velocity (rad/s) relative to the wrist (paper: in the world).
+    Metres, canonical axes of this hand's wrist at ``time_s``. Per sample: distance of the other wrist; this wrist's
+    position, z axis and y axis; the position of the object's box centre (paper: centre of mass), and its angular
+    velocity (rad/s) relative to the wrist (paper: in the world).
     """
     own_wrist, other_wrist = control.wrists[side], control.wrists[SIDES[1 - SIDES.index(side)]]
     canonical = hand.wrist_from_canonical
     start, stop = own_wrist.time_s[0], own_wrist.time_s[-1]
     samples = np.clip(time_s[:, None] + settings.samples_s, start, stop)
-    wrist_now, wrist_samples, object_samples = (
-        own_wrist.at(time_s),
-        own_wrist.at(samples),
-        control.object_motion.at(samples),
-    )
+    wrist_now, wrist_samples = own_wrist.at(time_s), own_wrist.at(samples)
+    object_samples = control.object_motion.at(samples)
     wrist_from_world = wrist_now.inverse()
     to_other_m = other_wrist.at(samples).translation - wrist_now.translation[:, None]
     other_distance_m = np.linalg.norm(to_other_m, axis=-1, keepdims=True)
@@ -138,8 +115,7 @@ def trajectory_features(
     angular_velocity = np.linalg.det(canonical) * angular_velocity @ canonical
     positions_m = [(wrist_from_world @ points) @ canonical for points in (wrist_samples.translation, middle)]
     features = other_distance_m, positions_m[0], axes[..., 2], axes[..., 1], positions_m[1], angular_velocity
-    by_sample = np.concatenate(features, axis=-1)
-    return by_sample.reshape(len(time_s), -1)
+    return np.concatenate(features, axis=-1).reshape(len(time_s), -1)
 
 
 def _angular_velocity(
@@ -169,19 +145,22 @@ def object_from_wrist(
 
 
 def hand_inputs(
-    control: Control,
-    side: Side,
-    hand: TrackedHand,
-    state: HandState,
-    time_s: np.ndarray,
-    surface: SurfaceIndex,
-    settings: FeatureSettings,
-) -> HandInputs:
-    """All inputs of one hand at ``time_s (frame,)``; state: (frame,) the hand in its wrist's frame."""
+    control: Control, side: Side, hand: TrackedHand, state: HandState, time_s: np.ndarray, settings: FeatureSettings
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pose (frame, 192), trajectory (frame, 336) and sensors (frame, 1822) of one hand at ``time_s (frame,)``.
+
+    state: (frame,) the hand in its wrist's frame. The sizes are those of ManipNet's hand.
+    """
     placed, hinge_rad = object_from_wrist(control, side, time_s, settings)
-    sensed = sense(hand, state, placed, hinge_rad, surface, settings.sensors)
+    sensed = sense(hand, state, placed, hinge_rad, surface_index(control.model), settings.sensors)
     trajectory = trajectory_features(control, side, hand, time_s, settings)
-    return HandInputs(pose_features(hand, state, settings), trajectory, sensed.flat())
+    return pose_features(hand, state, settings), trajectory, sensed.flat()
+
+
+def mirrored_to_right(hand: TrackedHand, fingers: np.ndarray) -> np.ndarray:
+    """Mirror finger rotations of a left hand to a right hand, or back; those of a right hand are unchanged."""
+    mirror = np.array([-1.0, 1.0, 1.0])
+    return mirror[:, None] * fingers * mirror if hand.side == "left" else fingers
 
 
 def distance_offset_m(hand: TrackedHand, settings: FeatureSettings) -> np.ndarray:

@@ -52,15 +52,10 @@ def rotvecs_from_rest(hand: TrackedHand, finger_rotmats: np.ndarray) -> np.ndarr
 def reach(
     hand: TrackedHand, limits: Limits, state: HandState, target_m: np.ndarray, weight: np.ndarray, steps: int = STEPS
 ) -> np.ndarray:
-    """Rotate finger joints so that points reach their targets.
+    """Finger rotations (1, joint - 1, 3, 3) with which points reach ``target_m`` (point, 3), joints then tips.
 
-    Args:
-        state: one frame, wrist frame.
-        target_m: (point, 3) wrist frame, joints then tips.
-        weight: (point,) of the squared error; 0: no target. The wrist and the knuckles cannot move.
-
-    Returns:
-        (1, joint - 1, 3, 3) finger rotations.
+    All is in the wrist's frame. state: one frame, the start. weight: (point,) of the squared error; 0: no target. The
+    wrist and the knuckles cannot move.
     """
     last = hand.tip_joint
     from_last = state.joint_rotmats[0, last].swapaxes(-1, -2)

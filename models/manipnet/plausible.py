@@ -69,11 +69,7 @@ class Reading(NamedTuple):
 
 
 def plausible_reading(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, TrackedHand]) -> Reading:
-    """The file as given.
-
-    Raises:
-        BadInput: if it is implausible; the remedy names the one change that makes it plausible.
-    """
+    """The file as given. Raises BadInput if it is implausible; the remedy names the change that makes it plausible."""
     as_given = reading(file, model, hands)
     alternatives = [(fault, reading(changed_file, model, hands)) for fault, changed_file in _other_conventions(file)]
     alternatives = [item for item in alternatives if item[1].is_good]
@@ -83,8 +79,7 @@ def plausible_reading(file: TrajectoryFile, model: ObjectModel, hands: Mapping[S
         if alternatives and alternatives[0][1].gain_over(as_given) > MIN_GAIN:
             raise alternatives[0][0]
         return as_given
-    scaled_readings = [(unit, reading(changed_file, model, hands)) for unit, changed_file in _other_units(file)]
-    plausible_units = [unit for unit, scaled_reading in scaled_readings if scaled_reading.is_good]
+    plausible_units = [unit for unit, scaled_file in _other_units(file) if reading(scaled_file, model, hands).is_good]
     if alternatives and not plausible_units:
         raise alternatives[0][0]
     remedy = as_given.fault.remedy
@@ -158,16 +153,13 @@ class _PlacedHand:
         palm_directions = self.object_from_wrist[reachable] @ (self.hand.wrist_from_canonical @ PALM_DIRECTION)
         wrist_m, rotations = self.wrist_m[reachable], Rotation.from_matrix(self.object_from_wrist[reachable])
         middle_m = self.control.model.vertices_m.mean(axis=0)
-        cosines = [
-            _mean_cosine(palm_directions, target_m - wrist_m) for target_m in (middle_m, self.closest_m[reachable])
-        ]
+        targets_m = middle_m, self.closest_m[reachable]
+        cosines = [_mean_cosine(palm_directions, target_m - wrist_m) for target_m in targets_m]
         position_spread_m = float(np.linalg.norm(wrist_m.std(axis=0)))
         rotation_spread_rad = float(np.sqrt(((rotations.mean().inv() * rotations).magnitude() ** 2).mean()))
         distance_m = max(float(np.median(self.palm_distance_m[reachable])), 0.0)
-        return Fit(
-            sum(cosines) / 2,
-            PER_PALM_M * distance_m + PER_SPREAD_M * position_spread_m + PER_SPREAD_RAD * rotation_spread_rad,
-        )
+        penalty = PER_PALM_M * distance_m + PER_SPREAD_M * position_spread_m + PER_SPREAD_RAD * rotation_spread_rad
+        return Fit(sum(cosines) / 2, penalty)
 
 
 def _mean_cosine(directions: np.ndarray, vectors: np.ndarray) -> float:
@@ -179,29 +171,24 @@ def _mean_cosine(directions: np.ndarray, vectors: np.ndarray) -> float:
 def _far(file: TrajectoryFile, nearest_m: Mapping[Side, float]) -> BadInput | None:
     if min(nearest_m.values()) < NEAR_M:
         return None
+    expected = f"a palm that comes within {NEAR_M} m of the object"
     got = ", ".join(f"the {side} one {metres:.3g} m" for side, metres in nearest_m.items())
-    return BadInput(
-        file.source, f"a palm that comes within {NEAR_M} m of the object", got, "check the positions and their unit"
-    )
+    return BadInput(file.source, expected, got, "check the positions and their unit")
 
 
 def _inside(file: TrajectoryFile, placed_hands: Mapping[Side, _PlacedHand]) -> BadInput | None:
     """The fault of a palm deep in the object, or a wrist in its convex hull, in most near frames."""
     for side, placed in placed_hands.items():
+        name = placed.control.model.name
         if (fraction := placed.fraction_of_near(placed.palm_distance_m < -MAX_PALM_DEPTH_M)) > MAX_FRACTION:
             got = f"a {side} palm inside it in {100 * fraction:.0f} % of the frames in which it is near"
             remedy = "perhaps the mesh has another unit (--unit cm), or another origin than in the trajectories"
-            return BadInput(file.source, f"{placed.control.model.name} outside of the hands", got, remedy)
+            return BadInput(file.source, f"{name} outside of the hands", got, remedy)
         buried = placed.distance_m(_hull(placed.control.model)) < MIN_WRIST_DISTANCE_M
         if (fraction := placed.fraction_of_near(buried)) > MAX_FRACTION:
             got = f"a {side} wrist in it or closer in {100 * fraction:.0f} % of the frames in which the palm is near"
             remedy = "check the unit of the positions (--trajectory-unit) and of the mesh (--unit)"
-            return BadInput(
-                file.source,
-                f"a wrist at least {100 * MIN_WRIST_DISTANCE_M} cm off {placed.control.model.name}",
-                got,
-                remedy,
-            )
+            return BadInput(file.source, f"a wrist at least {100 * MIN_WRIST_DISTANCE_M} cm off {name}", got, remedy)
     return None
 
 
@@ -249,7 +236,6 @@ def _other_units(file: TrajectoryFile) -> Iterator[tuple[str, TrajectoryFile]]:
     """The file in other units, in the order of their ratio to the given one."""
     if not file.unit:
         return
-    # The ratio of each unit to the given one.
     factors = {unit: metres / UNITS_M[file.unit] for unit, metres in UNITS_M.items() if unit != file.unit}
     for unit, factor in sorted(factors.items(), key=lambda item: abs(np.log(item[1]))):
         yield unit, file.with_bodies(lambda body, factor=factor: replace(body, position_m=body.position_m * factor))

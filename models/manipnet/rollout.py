@@ -18,6 +18,7 @@ import torch
 from hoidata.clips.clip import Side
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import HandState, TrackedHand
+from hoidata.objects.distance import SignedDistance
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
 from hoidata.sensors import sense
 from models.manipnet.control import Control, interpolate_rotations, poses_at
@@ -45,15 +46,6 @@ MIN_WEIGHT = 0.5  # weight of the predicted pose for points without a contact pr
 
 
 @dataclass(frozen=True)
-class Nearest:
-    """The object's surface nearest to some points."""
-
-    distance_m: np.ndarray  # (..., point) signed, negative inside
-    closest_m: np.ndarray  # (..., point, 3) on the surface
-    normal: np.ndarray  # (..., point, 3) outward
-
-
-@dataclass(frozen=True)
 class Targets:
     """Target positions for inverse kinematics."""
 
@@ -62,16 +54,11 @@ class Targets:
 
 
 def paper_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarray, range_m: float,
-                  nearest: Nearest) -> Targets:  # fmt: skip
-    """Algorithm 1: move active points to a mixture of predicted and true distance.
+                  nearest: SignedDistance) -> Targets:  # fmt: skip
+    """Algorithm 1: move active points to a mixture of predicted and true distance; inactive points stay.
 
-    Args:
-        points_m: (..., point, 3) of the predicted pose.
-        predicted: (..., point) output distances, as fractions of ``range_m``.
-        nearest: the object's surface at ``points_m``.
-
-    Returns:
-        Targets of all points; inactive points stay.
+    points_m: (..., point, 3) of the predicted pose, where the object's surface is ``nearest``; predicted: (..., point)
+    output distances, as fractions of ``range_m``.
     """
     distance_m = predicted * range_m + radius_m
     inside = nearest.distance_m < 0
@@ -81,7 +68,7 @@ def paper_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndar
 
 
 def our_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarray, range_m: float,
-                is_near: np.ndarray, thickness_m: np.ndarray, nearest: Nearest) -> Targets:  # fmt: skip
+                is_near: np.ndarray, thickness_m: np.ndarray, nearest: SignedDistance) -> Targets:  # fmt: skip
     """Our rule: keep the predicted pose, press points that are predicted to touch, and limit penetration.
 
     Algorithm 1 has three problems. It stops at the surface, where a contact has no pressure. A predicted distance is a
@@ -90,12 +77,8 @@ def our_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarra
     inside. It takes the surface plane at the pose that the solver starts from (``nearest``): a point below that
     plane is inside.
 
-    Args:
-        points_m: (point, 3) of the predicted pose.
-        predicted: (point,) output distances, as fractions of ``range_m``.
-        is_near: (point,) bool, whether the predicted points are at the object or in it.
-        thickness_m: (point,) radius of the finger at the point.
-        nearest: the object's surface at the points of the solver's present pose.
+    points_m, predicted: as in ``paper_targets``, (point, 3) and (point,). is_near: (point,) bool, whether the predicted
+    points are at the object or in it. thickness_m: (point,) radius of the finger at the point.
     """
     target_height_m = predicted * range_m + radius_m - PRESS_M
     min_height_m = thickness_m - MAX_INDENTATION_M
@@ -137,11 +120,6 @@ class Predictor:
     def chosen_rule(self) -> Rule:
         return self.settings.definition if self.rule == "preset" else self.rule
 
-    def limits(self, hand: TrackedHand) -> Limits:
-        """Joint limits of a hand: those of the training poses, and of its hinge joints."""
-        low, high = (array.double().numpy() for array in (self.network.low_rad, self.network.high_rad))
-        return Limits.of(hand, low, high)
-
     @torch.no_grad()
     def __call__(self, inputs: np.ndarray) -> np.ndarray:
         """Outputs (hand, 214) for inputs (hand, 2350)."""
@@ -152,9 +130,9 @@ class Predictor:
 class FrameContext:
     """The control signal of one hand in one frame."""
 
-    trajectory: np.ndarray  # (336,) features
-    object_from_wrist: RigidTransform  # (time,) at the present and the sensors' future times
-    hinge_rad: np.ndarray | None  # (time,); None for a rigid object
+    trajectory: np.ndarray  # (1, 336) features
+    object_from_wrist: RigidTransform  # (1, time) at the present and the sensors' future times
+    hinge_rad: np.ndarray | None  # (1, time); None for a rigid object
 
 
 def frame_context(
@@ -162,9 +140,8 @@ def frame_context(
 ) -> FrameContext:
     """Wrist and object trajectories around one time. One call per time: the last bits depend on the batch size."""
     times_s = np.array([time_s])
-    transforms, hinge = object_from_wrist(control, side, times_s, settings)
     trajectory = trajectory_features(control, side, hand, times_s, settings)
-    return FrameContext(trajectory[0], transforms[0], None if hinge is None else hinge[0])
+    return FrameContext(trajectory, *object_from_wrist(control, side, times_s, settings))
 
 
 @dataclass
@@ -181,19 +158,18 @@ class HandRollout:
     state: HandState = field(init=False)  # of ``finger_rotmats``
 
     def __post_init__(self) -> None:
-        self.limits = self.predictor.limits(self.hand)
+        network = self.predictor.network
+        # The limits of the training poses, and of the hand's hinge joints.
+        self.limits = Limits.of(self.hand, network.low_rad.double().numpy(), network.high_rad.double().numpy())
         radius = self.hand.point_radius_m
         self.thickness_m = np.r_[radius[: self.hand.n_joints], radius[self.hand.tip_joint]]
         self._set_pose(np.asarray(self.finger_rotmats, dtype=np.float64).reshape(1, -1, 3, 3))
 
     def inputs(self, frame: FrameContext) -> np.ndarray:
         """(2350,) the network's input for a frame."""
-        hinge = None if frame.hinge_rad is None else frame.hinge_rad[None]
-        transform = frame.object_from_wrist
-        placed = RigidTransform(transform.rotation[None], transform.translation[None])
-        sensed = sense(self.hand, self.state, placed, hinge, self.surface, self.predictor.settings.sensors)
-        pose = pose_features(self.hand, self.state, self.predictor.settings)
-        return np.concatenate([pose[0], frame.trajectory, sensed.flat()[0]])
+        hand, state, settings = self.hand, self.state, self.predictor.settings
+        sensed = sense(hand, state, frame.object_from_wrist, frame.hinge_rad, self.surface, settings.sensors)
+        return np.concatenate([pose_features(hand, state, settings), frame.trajectory, sensed.flat()], axis=1)[0]
 
     def advance(self, output: np.ndarray, next_frame: FrameContext) -> None:
         """Go to the next frame with an output (214,) of the network, post-processed.
@@ -223,7 +199,7 @@ class HandRollout:
         if self.predictor.chosen_rule == "paper":
             return self._solve(self.state, paper_targets(*shared, nearest))
         is_near = nearest.distance_m < self.thickness_m + AT_OBJECT_M
-        state = self.hand.state(interpolate_rotations(previous_answer, self.finger_rotmats, np.full(1, BLEND_FRACTION)))
+        state = hand.state(interpolate_rotations(previous_answer, self.finger_rotmats, np.full(1, BLEND_FRACTION)))
         for _ in range(SOLVER_ROUNDS):  # the planes depend on the pose
             from_state = self._nearest(state.point_m[0], next_frame)
             state = self._solve(state, our_targets(*shared, is_near, self.thickness_m, from_state))
@@ -258,15 +234,13 @@ class HandRollout:
             weight[points] = 1
         return Targets(target_m, weight)
 
-    def _nearest(self, points_m: np.ndarray, frame: FrameContext) -> Nearest:
+    def _nearest(self, points_m: np.ndarray, frame: FrameContext) -> SignedDistance:
         """The object's surface at points (point, 3), wrist frame."""
-        object_from_wrist = frame.object_from_wrist[0]
-        hinge_rad = None if frame.hinge_rad is None else frame.hinge_rad[:1]
-        nearest = self.surface.nearest((object_from_wrist @ points_m)[None], hinge_rad)
+        object_from_wrist = frame.object_from_wrist[0, 0]
+        hinge_rad = None if frame.hinge_rad is None else frame.hinge_rad[0, :1]
+        distance_m, closest_m, normal = self.surface.nearest((object_from_wrist @ points_m)[None], hinge_rad)
         wrist_from_object = object_from_wrist.inverse()
-        return Nearest(
-            nearest.distance_m[0], wrist_from_object @ nearest.closest_m[0], wrist_from_object.turn(nearest.normal[0])
-        )
+        return SignedDistance(distance_m[0], wrist_from_object @ closest_m[0], wrist_from_object.turn(normal[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,12 +255,9 @@ class RolloutTask:
 
 
 def roll_out(predictor: Predictor, tasks: Sequence[RolloutTask]) -> list[np.ndarray]:
-    """Roll out several hands.
+    """Roll out several hands: finger rotations (frame, joint - 1, 3, 3) of each task, with the start pose first.
 
     The hands of a frame share one call of the network. Its last bits depend on the number of hands.
-
-    Returns:
-        Finger rotations (frame, joint - 1, 3, 3) of each task, with the start pose first.
     """
     rate = 1 / predictor.settings.step_s
     step_numbers = [(task.time_s - task.time_s[0]) * rate for task in tasks]  # of each task's frames, fractional

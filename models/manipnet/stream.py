@@ -10,7 +10,7 @@
 
 import operator
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from itertools import chain
 from typing import NamedTuple, TypeGuard
 
@@ -47,18 +47,12 @@ class TrackedFrame:
 def tracked_frames(control: Control) -> Iterator[TrackedFrame]:
     """The frames of recorded trajectories, as a tracker delivers them."""
     time_s = control.object_motion.time_s
-    wrist_poses, object_poses = [control.wrists[side].at(time_s) for side in SIDES], control.object_motion.at(time_s)
-    hinge = None if control.hinge_rad is None else control.hinge_at(time_s)
+    wrist_poses: dict[Side, RigidTransform] = {side: control.wrists[side].at(time_s) for side in SIDES}
+    object_poses, hinge_rad = control.object_motion.at(time_s), control.hinge_at(time_s)
     for frame, frame_s in enumerate(time_s.tolist()):
-        wrists: dict[Side, RigidTransform | None] = dict(zip(SIDES, (_at(p, frame) for p in wrist_poses), strict=True))
-        pose, angle = _at(object_poses, frame), None if hinge is None else float(hinge[frame])
-        yield TrackedFrame(
-            frame_s, wrists, dict.fromkeys(SIDES, pose), None if angle is None else dict.fromkeys(SIDES, angle)
-        )
-
-
-def _at(poses: RigidTransform, frame: int) -> RigidTransform:
-    return RigidTransform(poses.rotation[frame], poses.translation[frame])
+        wrists: dict[Side, RigidTransform | None] = {side: poses[frame] for side, poses in wrist_poses.items()}
+        angles = None if hinge_rad is None else dict.fromkeys(SIDES, float(hinge_rad[frame]))
+        yield TrackedFrame(frame_s, wrists, dict.fromkeys(SIDES, object_poses[frame]), angles)
 
 
 class Sample(NamedTuple):
@@ -90,12 +84,11 @@ def is_jump(before: Sample, after: Sample) -> bool:
 
 def add_sample(trajectories: list[Trajectory], sample: Sample, max_gap_s: float) -> None:
     """Append to the last trajectory; start a new one after a gap or jump."""
-    if trajectories:
-        last = trajectories[-1][-1]
-        if sample.time_s - last.time_s <= max_gap_s and not is_jump(last, sample):
-            trajectories[-1].append(sample)
-            return
-    trajectories.append([sample])
+    last = trajectories[-1][-1] if trajectories else None
+    if last and sample.time_s - last.time_s <= max_gap_s and not is_jump(last, sample):
+        trajectories[-1].append(sample)
+    else:
+        trajectories.append([sample])
 
 
 def trajectory_at(trajectories: list[Trajectory], time_s: float) -> Trajectory:
@@ -116,9 +109,8 @@ def joined_at(trajectories: list[Trajectory], time_s: float) -> Trajectory:
 
 def motion_of(samples: Trajectory) -> Motion:
     """A trajectory with interpolation."""
-    rotmats, position_m = (
-        np.stack([getattr(sample.pose, name) for sample in samples]) for name in ("rotation", "translation")
-    )
+    rotmats = np.stack([sample.pose.rotation for sample in samples])
+    position_m = np.stack([sample.pose.translation for sample in samples])
     return Motion(np.array([sample.time_s for sample in samples]), rotmats, position_m)
 
 
@@ -141,9 +133,8 @@ def control_of_frames(frames: Sequence[TrackedFrame], model: ObjectModel) -> tup
         wrists[side] = motion_of(samples) if samples else untracked_wrist(body.time_s, body.position_m)
         sample_s = np.array([sample.time_s for sample in samples])
         before_s = np.append(sample_s, -np.inf)[np.searchsorted(sample_s, time_s + ROUNDING_S) - 1]
-        valid.append(
-            np.append(sample_s, np.inf)[np.searchsorted(sample_s, time_s - ROUNDING_S)] - before_s <= MAX_GAP_S
-        )
+        after_s = np.append(sample_s, np.inf)[np.searchsorted(sample_s, time_s - ROUNDING_S)]
+        valid.append(after_s - before_s <= MAX_GAP_S)
     hinge_rad = np.array([sample.hinge_rad for sample in bodies[2]]) if model.is_articulated else None
     return Control(wrists, body, model, hinge_rad).at(time_s), np.stack(valid)
 
@@ -171,39 +162,30 @@ class _HandStream:
         self.blend_start, self.blended = self.pose, 0.0
 
 
+@dataclass(eq=False)
 class Stream:
     """Predicts finger poses while a tracker delivers frames.
 
     Pose k is for k network steps after the first frame, at any frame rate of the tracker. ``push`` returns it once the
     frames within the look-ahead have arrived; ``finish`` returns the remaining poses.
-
-    Args:
-        predictor: the network.
-        hands: the hands to animate.
-        models: the object of each hand.
-        start: finger rotations (joint - 1, 3, 3) in the first frame.
     """
 
-    def __init__(
-        self,
-        predictor: Predictor,
-        hands: Mapping[Side, TrackedHand],
-        models: Mapping[Side, ObjectModel],
-        start: Mapping[Side, np.ndarray],
-    ) -> None:
-        self.predictor, self.hands, self.models = predictor, hands, dict(models)
-        settings = predictor.settings
+    predictor: Predictor
+    hands: Mapping[Side, TrackedHand]  # to animate
+    models: dict[Side, ObjectModel]  # the object of each hand
+    start: InitVar[Mapping[Side, np.ndarray]]  # (joint - 1, 3, 3) finger rotations in the first frame
+
+    def __post_init__(self, start: Mapping[Side, np.ndarray]) -> None:
+        self.models, settings = dict(self.models), self.predictor.settings
         read_s = [*settings.samples_s, *settings.sensors.times_s]  # relative to the present
         self._behind_s, self._ahead_s = -min(read_s), max(settings.step_s, *read_s)
-        surfaces = {side: surface_index(models[side]).prepare() for side in hands}
-        self._hands: dict[Side, _HandStream] = {
-            side: _HandStream(
-                HandRollout(predictor, hands[side], surfaces[side], start[side]), start[side], models[side]
-            )
-            for side in hands
-        }
+        self._hands: dict[Side, _HandStream] = {}
+        for side, hand in self.hands.items():
+            model = self.models[side]
+            rollout = HandRollout(self.predictor, hand, surface_index(model).prepare(), start[side])
+            self._hands[side] = _HandStream(rollout, start[side], model)
         self._wrists: dict[Side, list[Trajectory]] = {side: [] for side in SIDES}
-        self._objects: dict[Side, list[Trajectory]] = {side: [] for side in hands}
+        self._objects: dict[Side, list[Trajectory]] = {side: [] for side in self.hands}
         self.pose_count, self.first_s, self.last_s = 0, -np.inf, -np.inf  # times of the first and last frame
         self._clock_offset_s, self._late_frames = 0.0, 0
 
@@ -260,14 +242,12 @@ class Stream:
             sides: list[Side] = [
                 side for side in self.hands if self._is_tracked(side, now_s) and self._is_tracked(side, next_s)
             ]
-            inputs = [self._inputs(side, now_s) for side in sides]
-            outputs = self.predictor(np.stack(inputs)) if sides else []
+            outputs = self.predictor(np.stack([self._inputs(side, now_s) for side in sides])) if sides else []
             for side, output in zip(sides, outputs, strict=True):
                 # Post-processing reads only the present of the following frame; its future may not have arrived.
                 control, settings = self._control(side, next_s), self.predictor.settings
-                transforms, hinge = object_from_wrist(control, side, np.array([next_s]), settings)
-                following = FrameContext(np.empty(0), transforms[0], None if hinge is None else hinge[0])
-                self._hands[side].rollout.advance(output, following)
+                following = object_from_wrist(control, side, np.array([next_s]), settings)
+                self._hands[side].rollout.advance(output, FrameContext(np.empty(0), *following))
                 self._hands[side].blended += settings.step_s / BLEND_S
             yield self._next_poses()
             for bodies in chain(self._wrists.values(), self._objects.values()):

@@ -18,7 +18,7 @@ from hoidata.devices import send
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.hands.tracked_hand import TrackedHand
-from hoidata.objects.surface_index import SurfaceIndex, surface_index
+from hoidata.objects.surface_index import surface_index
 from hoidata.sensors import sensor_size
 from models.common.family import Losses, Network, Setup
 from models.manipnet.control import (
@@ -30,12 +30,10 @@ from models.manipnet.control import (
     poses_at,
     trajectories_of,
 )
-from models.manipnet.features import FeatureSettings, hand_inputs, outputs, sizes, std_floors
+from models.manipnet.features import FeatureSettings, hand_inputs, mirrored_to_right, outputs, sizes, std_floors
 from models.manipnet.inverse_kinematics import rotvecs_from_rest
 from models.manipnet.network import ManipNet, NetworkConfig
-from models.manipnet.retrieval import mirrored_to_right
 
-NETWORK_ARRAYS = ("inputs", "outputs")
 MARGIN_RAD = 0.1  # joint limits are those of the training poses, extended by this
 
 
@@ -55,63 +53,53 @@ def hand_examples(
     finger_rotmats: np.ndarray,
     time_s: np.ndarray,
     usable: np.ndarray,
-    surface: SurfaceIndex,
     settings: FeatureSettings,
     start_rotmats: np.ndarray | None = None,
 ) -> Examples:
-    """Training steps of a recorded hand.
+    """Training steps of a hand with recorded ``finger_rotmats`` (frame, joint - 1, 3, 3) at ``time_s``, one step apart.
 
-    Args:
-        finger_rotmats: (frame, joint - 1, 3, 3) recorded.
-        time_s: (frame,) one step apart.
-        usable: (frame,) bool; a step needs two usable frames.
-        start_rotmats: (frame, joint - 1, 3, 3) perturbed poses to start from; the targets are the recorded ones.
-            The paper trains from recorded poses only. Such a network may keep any pose it is given.
+    usable: (frame,) bool; a step needs two usable frames. start_rotmats: (frame, joint - 1, 3, 3) perturbed poses to
+    start from; the targets are the recorded ones. The paper trains from recorded poses only. Such a network may keep
+    any pose it is given.
     """
     first = np.flatnonzero(usable[:-1] & usable[1:])
     start = finger_rotmats[first] if start_rotmats is None else start_rotmats[first]
-    inputs = hand_inputs(control, side, hand, hand.state(start), time_s[first], surface, settings)
-    object_from_wrist = control.object_motion.at(time_s[first + 1]).inverse() @ control.wrists[side].at(
-        time_s[first + 1]
-    )
-    hinge = control.hinge_at(time_s[first + 1])
-    next_state = hand.state(finger_rotmats[first + 1])
-    distance_m = surface.nearest(object_from_wrist @ next_state.point_m, hinge).distance_m
-    targets = outputs(hand, next_state, distance_m, settings)
+    inputs = hand_inputs(control, side, hand, hand.state(start), time_s[first], settings)
+    next_s, next_state = time_s[first + 1], hand.state(finger_rotmats[first + 1])
+    object_from_wrist = control.object_motion.at(next_s).inverse() @ control.wrists[side].at(next_s)
+    surface, hinge_rad = surface_index(control.model), control.hinge_at(next_s)
+    distance_m = surface.nearest(object_from_wrist @ next_state.point_m, hinge_rad).distance_m
+    targets = outputs(hand, next_state, distance_m, settings).astype(np.float32)
     input_rows = np.concatenate(inputs, axis=1, dtype=np.float32)
-    return Examples(first, input_rows, targets.astype(np.float32), rotvecs_from_rest(hand, finger_rotmats[first]))
+    return Examples(first, input_rows, targets, rotvecs_from_rest(hand, finger_rotmats[first]))
+
+
+def joined(examples: Sequence[Examples]) -> Examples:
+    """The steps of several hands, one after the other."""
+    return Examples(*map(np.concatenate, zip(*examples, strict=True)))
 
 
 def perturbed_poses(fingers: np.ndarray, pool: np.ndarray, seed: int) -> np.ndarray:
     """Perturb poses (frame, joint - 1, 3, 3): move each by a random fraction towards a random pose of the pool."""
     rng = np.random.default_rng(seed)
-    return interpolate_rotations(
-        fingers, pool[rng.integers(len(pool), size=len(fingers))], rng.uniform(0, 1, len(fingers))
-    )
+    targets = pool[rng.integers(len(pool), size=len(fingers))]
+    return interpolate_rotations(fingers, targets, rng.uniform(0, 1, len(fingers)))
 
 
 def sized_config(config: NetworkConfig, hand: TrackedHand) -> NetworkConfig:
     """The configuration with the input and output sizes of a hand."""
     count = sizes(hand, config.features)
-    return replace(
-        config,
-        pose=count["pose"],
-        trajectory=count["trajectory"],
-        sensors=sensor_size(hand, config.features.sensors),
-        output=count["pose"] + hand.n_points,
-        joints=hand.n_joints,
-    )
+    inputs = {"pose": count["pose"], "trajectory": count["trajectory"]}
+    sensors, output = sensor_size(hand, config.features.sensors), count["pose"] + hand.n_points
+    return replace(config, **inputs, sensors=sensors, output=output, joints=hand.n_joints)
 
 
 def build_network(config: NetworkConfig, hand: TrackedHand, examples: Sequence[Examples]) -> ManipNet:
     """A network with normalisation and joint limits from training examples, and random weights."""
-    network = ManipNet(sized_config(config, hand))
-    inputs, targets = (
-        torch.from_numpy(np.concatenate([getattr(example, name) for example in examples])) for name in NETWORK_ARRAYS
-    )
-    std_floor = [torch.from_numpy(values).float() for values in std_floors(hand, config.features)]
-    network.learn_normalisation(inputs, targets, (std_floor[0], std_floor[1]))
-    turns = torch.from_numpy(np.concatenate([example.rotvecs_rad for example in examples]))
+    network, (_, *arrays) = ManipNet(sized_config(config, hand)), joined(examples)
+    inputs, targets, turns = map(torch.from_numpy, arrays)
+    input_floor, output_floor = (torch.from_numpy(values).float() for values in std_floors(hand, config.features))
+    network.learn_normalisation(inputs, targets, (input_floor, output_floor))
     network.low_rad.copy_(turns.amin(0) - MARGIN_RAD)
     network.high_rad.copy_(turns.amax(0) + MARGIN_RAD)
     return network
@@ -133,13 +121,12 @@ class LossConfig:
 def clip_examples(
     sample: ClipSample, pair: HandPair, settings: FeatureSettings, pool: np.ndarray | None = None
 ) -> list[Examples]:
-    """Training steps of the active hands of a whole clip.
+    """Training steps of the active hands of a whole clip, from poses perturbed towards those of a pool, or recorded.
 
-    Args:
-        pool: (pose, 15, 3, 3) as a right hand's; steps start from poses perturbed towards it. None: recorded poses.
+    pool: (pose, 15, 3, 3) as a right hand's; None: recorded poses.
     """
     hands = hands_of(pair, sample.betas, sample.template_m)
-    control, surface = control_of(trajectories_of(sample), sample.object_model), surface_index(sample.object_model)
+    control = control_of(trajectories_of(sample), sample.object_model)
     clip_frame = np.arange(int((sample.length - 1) / (FPS * settings.step_s) + 1e-6) + 1) * settings.step_s * FPS
     frames = np.floor(clip_frame + 1e-6).astype(int), np.ceil(clip_frame - 1e-6).astype(int)
     time_s, examples = clip_frame / FPS, []
@@ -150,8 +137,7 @@ def clip_examples(
         usable = sample.valid[side_index][frames[0]] & sample.valid[side_index][frames[1]]
         seed = int.from_bytes(sha256(f"{sample.clip_id} {side}".encode()).digest()[:7])
         start_rotmats = None if pool is None else perturbed_poses(fingers, mirrored_to_right(hand, pool), seed)
-        arguments = (control, side, hand, fingers, time_s, usable, surface, settings, start_rotmats)
-        steps = hand_examples(*arguments)
+        steps = hand_examples(control, side, hand, fingers, time_s, usable, settings, start_rotmats)
         examples.append(steps._replace(frame=frames[0][steps.frame]))
     return examples
 
@@ -179,8 +165,7 @@ class FingersObjective:
 
     def __init__(self, setup: Setup) -> None:
         pair, self.loss, self.device = setup.corpus.annotated.store.hand_pair(), setup.loss, setup.device
-        settings = setup.network.features
-        train = setup.corpus.train
+        settings, train = setup.network.features, setup.corpus.train
         clips = [train.whole(clip_id) for clip_id in train.ids]
         pools = (None, pose_pool(clips, pair)) if self.loss.perturbed_fraction else (None,)
         # By clip, for each hand: its steps from recorded poses, and those from perturbed poses.
@@ -195,11 +180,7 @@ class FingersObjective:
         if setup.corpus.held_out and not validation:
             expected = "a hand that is tracked in two consecutive frames"
             raise BadInput("validation", expected, "none in its clips", "put other clips into the validation part")
-        self.held_out: list[np.ndarray] | None = None  # inputs and outputs of the validation steps
-        if validation:
-            self.held_out = [
-                np.concatenate([getattr(example, name) for example in validation]) for name in NETWORK_ARRAYS
-            ]
+        self.held_out = joined(validation) if validation else None
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         steps = [pair for sample in batch.samples for pair in self._sampled_steps(sample, generator)]
@@ -212,29 +193,24 @@ class FingersObjective:
         """Inputs and outputs of random steps in the frames of a cropped clip, of any hand."""
         first, stop = sample.start, sample.start + sample.length - 1
         steps = [
-            (kinds, number_in_example)
+            (kinds, step)
             for kinds in self.examples[sample.clip_id]
-            for number_in_example in np.flatnonzero((kinds[0].frame >= first) & (kinds[0].frame < stop))
+            for step in np.flatnonzero((kinds[0].frame >= first) & (kinds[0].frame < stop))
         ]
         if not steps:
             return []
         chosen = torch.randint(len(steps), (self.loss.steps_per_clip,), generator=generator).tolist()
         random = torch.rand(self.loss.steps_per_clip, generator=generator)
         is_perturbed = (random < self.loss.perturbed_fraction).long().tolist()
-        sampled = [
-            (steps[number][0][kind], steps[number][1]) for number, kind in zip(chosen, is_perturbed, strict=True)
-        ]
-        return [
-            (example.inputs[number_in_example], example.outputs[number_in_example])
-            for example, number_in_example in sampled
-        ]
+        sampled = [(*steps[number], kind) for number, kind in zip(chosen, is_perturbed, strict=True)]
+        return [(kinds[kind].inputs[step], kinds[kind].outputs[step]) for kinds, step, kind in sampled]
 
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, ManipNet)
         assert self.held_out is not None
-        inputs, targets = (send(torch.from_numpy(rows), self.device) for rows in self.held_out)
-        return step_loss(network, inputs, targets)
+        arrays = self.held_out.inputs, self.held_out.outputs
+        return step_loss(network, *(send(torch.from_numpy(rows), self.device) for rows in arrays))
 
 
 MANIPNET = Network(

@@ -60,28 +60,23 @@ class TrajectoryFile:
 
 
 def read_trajectories(path: Path, unit: str = "", axes: Axes = "model") -> TrajectoryFile:
-    """Read a file in the format of its suffix.
+    """Read a file in the format of its suffix. Raises BadInput that names the line, column or array, and the remedy.
 
-    Args:
-        unit: of the positions in a CSV or NPZ file; "": metres.
-        axes: of the wrists in a CSV or NPZ file.
-
-    Raises:
-        BadInput: names the line, column or array, and the remedy.
+    unit, axes: of positions and wrists in a CSV or NPZ file; "": metres.
     """
+    expected, suffix = f"a file of trajectories ({', '.join(ENDINGS)})", path.suffix.lower()
     if unit and unit not in UNITS_M:
         raise BadInput("--trajectory-unit", f"one of {', '.join(UNITS_M)}", unit, "name the unit of the positions")
-    if path.suffix.lower() not in ENDINGS:
-        is_packed = path.suffix.lower() == ".gz"
-        remedy = f"unpack it: gunzip --keep {path}" if is_packed else "export it as one of these"
-        raise BadInput(path, f"a file of trajectories ({', '.join(ENDINGS)})", f"{path.suffix or 'no suffix'}", remedy)
+    if suffix not in ENDINGS:
+        remedy = f"unpack it: gunzip --keep {path}" if suffix == ".gz" else "export it as one of these"
+        raise BadInput(path, expected, f"{path.suffix or 'no suffix'}", remedy)
     if not path.is_file():
-        raise BadInput(path, f"a file of trajectories ({', '.join(ENDINGS)})", "nothing there", "correct the path")
+        raise BadInput(path, expected, "nothing there", "correct the path")
     if path.stat().st_size > MAX_BYTES:
         raise BadInput(path, f"at most {MAX_BYTES} bytes", f"{path.stat().st_size}", "cut it into pieces")
-    if path.suffix.lower() == ".npz":
+    if suffix == ".npz":
         trajectories = from_arrays(load_npz_arrays(path), str(path), unit or "m")
-    elif path.suffix.lower() == ".csv":
+    elif suffix == ".csv":
         trajectories = parse_csv(path.read_bytes(), str(path), unit or "m")
     elif unit or axes != "model":
         option = f"--trajectory-unit {unit}" if unit else f"--wrist-axes {axes}"
@@ -165,9 +160,7 @@ def _numbers(rows: list[list[str]], count: int, source: str) -> np.ndarray:
         if len(cells) != count:
             raise BadInput(f"{source}: row {number + 1}", f"{count} numbers", f"{len(cells)}", "correct the row")
     try:
-        table = np.array([[float(word) for word in cells] for cells in rows], dtype=np.float64).reshape(
-            len(rows), count
-        )
+        table = np.array([[float(word) for word in cells] for cells in rows], np.float64).reshape(len(rows), count)
     except ValueError as error:
         raise BadInput(source, "numbers", str(error)[:200], "correct the file") from error
     if not (is_finite := np.abs(table) < MAX_ABS_VALUE).all():
@@ -199,20 +192,16 @@ def _check_times(time_s: np.ndarray, source: str) -> None:
     step = float(np.median(steps))
     if not 1 / MAX_RATE_HZ <= step <= 1 / MIN_RATE_HZ:
         units_by_factor = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
-        units = [
-            name for factor, name in units_by_factor.items() if 1 / MAX_RATE_HZ <= step * factor <= 1 / MIN_RATE_HZ
-        ]
+        scaled = {name: step * factor for factor, name in units_by_factor.items()}
+        units = [name for name, step_s in scaled.items() if 1 / MAX_RATE_HZ <= step_s <= 1 / MIN_RATE_HZ]
         remedy = f"they look like {units[0]}: divide them" if units else "write seconds"
         if np.allclose(steps, 1):
             remedy = "they look like frame numbers: divide them by the frame rate"
         expected = f"seconds, {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} frames in each"
         raise BadInput(f"{source}: time_s", expected, f"a step of {step:g}", remedy)
     if steps.max() > MAX_STEP_S:
-        row_number = int(steps.argmax()) + 1
-        expected = f"steps of at most {MAX_STEP_S:g} s"
-        raise BadInput(
-            f"{source}: time_s", expected, f"{steps[row_number - 1]:g} s after row {row_number}", "cut the file there"
-        )
+        expected, got = f"steps of at most {MAX_STEP_S:g} s", f"{steps.max():g} s after row {int(steps.argmax()) + 1}"
+        raise BadInput(f"{source}: time_s", expected, got, "cut the file there")
 
 
 def _body(arrays: Mapping[str, np.ndarray], body: str, time_s: np.ndarray, source: str, unit_m: float) -> Motion:

@@ -83,7 +83,7 @@ def network(request: pytest.FixtureRequest) -> Denoiser:
 
 
 def predicted(network: Denoiser, windows: Windows, x: torch.Tensor) -> torch.Tensor:
-    return network(x, torch.full((len(windows),), 399), windows).detach()
+    return network(x, torch.full((len(windows.object_scale),), 399), windows).detach()
 
 
 def test_padding_has_no_effect(network: Denoiser) -> None:

@@ -20,7 +20,6 @@ from models.bimart.network import (
     MotionModel,
     SceneWindow,
     build_windows,
-    layout_of,
 )
 from models.bimart.sampler import (
     OURS,
@@ -162,7 +161,7 @@ def test_classifier_free_guidance_is_the_usual_formula_or_equation_7() -> None:
 @pytest.mark.parametrize("frames", [5, 8, 9, 12, 30])
 @pytest.mark.parametrize("overlapping", [True, False])
 def test_windows_cover_a_motion_and_joined_windows_are_the_motion(frames: int, overlapping: bool) -> None:
-    layout, motion = layout_of(frames, 8, overlapping), torch.randn(3, frames, 2)
+    layout, motion = Layout(frames, min(8, frames), overlapping), torch.randn(3, frames, 2)
     torch.testing.assert_close(layout.joined(layout.cut(motion)), motion)
     covered = {start + step for start in layout.starts for step in range(layout.length)}
     assert covered >= set(range(frames))
@@ -194,10 +193,10 @@ def test_the_state_is_the_objects_pose_relative_to_the_first_frame_or_its_local_
 
 def test_the_pose_state_is_relative_to_the_window_in_training_and_in_sampling() -> None:
     whole, config = scene(20), replace(TINY, features=replace(FEATURES, state="pose"))
-    windows = [SceneWindow(whole, start, start + 8, np.ones(2, bool)) for start in layout_of(20, 8, True).starts]
-    batch = build_windows(windows, 8, config)
+    windows = [SceneWindow(whole, start, start + 8, np.ones(2, bool)) for start in Layout(20, 8).starts]
+    batch = build_windows(windows, config)
     for row, window in enumerate(windows):
-        torch.testing.assert_close(batch.state[row], build_windows([window], 8, config).state[0])
+        torch.testing.assert_close(batch.state[row], build_windows([window], config).state[0])
         assert not batch.state[row, 0, 3:].any()
 
 
@@ -217,7 +216,6 @@ def test_a_feature_setting_changes_only_its_own_input(change: dict, differs: set
     kinds = [
         build_windows(
             [SceneWindow(scene(8, basis=config_features.basis), 0, 8, np.array([True, False]))],
-            8,
             replace(TINY, features=config_features),
         )
         for config_features in (FEATURES, features)

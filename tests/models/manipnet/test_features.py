@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from hoidata.clips.clip import Side
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
-from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.sensors.mano_hand import mano_hand
 from models.manipnet.control import Control, Motion
 from models.manipnet.features import (
@@ -80,15 +79,14 @@ def test_joint_rotations_are_recovered_from_the_features_of_either_hand(hand: Tr
 def test_inputs_are_unchanged_when_the_scene_moves_or_is_mirrored_with_the_hand(settings: FeatureSettings):
     scene, hand, time_s = control(), small_hand(), np.array([0.7, 0.71, 1.3])
     poses = random_rotations(3 * 5, 0.3, 4).reshape(3, 5, 3, 3)
-    surface = SurfaceIndex(scene.model)
-    original = hand_inputs(scene, "right", hand, hand.state(poses), time_s, surface, settings)
+    original = hand_inputs(scene, "right", hand, hand.state(poses), time_s, settings)
     rotation, translation = random_rotations(1, 2.0, 8)[0], np.array([1.0, -2.0, 3.0])
     wrists = {side: moved(motion, rotation, translation) for side, motion in scene.wrists.items()}
     moved_scene = Control(wrists, moved(scene.object_motion, rotation, translation), scene.model)
-    moved_inputs = hand_inputs(moved_scene, "right", hand, hand.state(poses), time_s, surface, settings)
+    moved_inputs = hand_inputs(moved_scene, "right", hand, hand.state(poses), time_s, settings)
     mirrored, left = mirrored_scene(scene), hand.mirrored()
     state = left.state(MIRROR @ poses @ MIRROR)
-    mirrored_inputs = hand_inputs(mirrored, "left", left, state, time_s, SurfaceIndex(mirrored.model), settings)
+    mirrored_inputs = hand_inputs(mirrored, "left", left, state, time_s, settings)
     for first, *others in zip(original, moved_inputs, mirrored_inputs, strict=True):
         for other in others:
             np.testing.assert_allclose(first, other, atol=1e-9)
@@ -126,11 +124,9 @@ def test_motion_is_interpolated_evenly_and_constant_beyond_its_ends():
 def test_a_short_trajectory_has_fewer_samples_and_fewer_sensed_times():
     short = FeatureSettings(future_s=0.1)
     hand, scene = small_hand(), control()
-    inputs = hand_inputs(
-        scene, "right", hand, hand.state(hand.rest_rotmats[None]), np.array([1.0]), SurfaceIndex(scene.model), short
-    )
-    assert inputs.trajectory.shape == (1, 13 * 16)
-    assert inputs.sensors.shape == (1, 1000 + 2 * (hand.n_sensors + hand.n_points) + 3 * hand.n_points)
+    inputs = hand_inputs(scene, "right", hand, hand.state(hand.rest_rotmats[None]), np.array([1.0]), short)
+    assert inputs[1].shape == (1, 13 * 16)
+    assert inputs[2].shape == (1, 1000 + 2 * (hand.n_sensors + hand.n_points) + 3 * hand.n_points)
 
 
 def test_output_distances_are_fractions_of_3_cm_from_the_capsule():

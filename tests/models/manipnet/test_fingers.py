@@ -15,6 +15,7 @@ from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
+from hoidata.objects.distance import SignedDistance
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.mano_hand import mano_hand
@@ -26,14 +27,12 @@ from models.common.training import train_network
 from models.manipnet.animate import Gap, predict_fingers
 from models.manipnet.control import control_of, finger_rotmats_of, hands_of, trajectories_of
 from models.manipnet.family import FingerSampler, diagnose, recorded_hands, thinned
-from models.manipnet.features import FeatureSettings, outputs, pose_features
+from models.manipnet.features import FeatureSettings, mirrored_to_right, outputs, pose_features
 from models.manipnet.inverse_kinematics import Limits, reach
 from models.manipnet.network import ManipNet, NetworkConfig
-from models.manipnet.retrieval import mirrored_to_right
 from models.manipnet.rollout import (
     FrameContext,
     HandRollout,
-    Nearest,
     Predictor,
     RolloutTask,
     our_targets,
@@ -160,9 +159,8 @@ def test_a_stream_equals_the_rollout_of_the_clip_bit_for_bit(
 
 
 def test_thinned_training_frames_are_spread_over_all_hands(
-    annotated: AnnotatedStore, samples: list[ClipSample], fingers: FingerSampler, checkpoints: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    annotated: AnnotatedStore, samples: list[ClipSample], checkpoints: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     hands = [hand for sample in samples for hand in recorded_hands(sample, HANDS)]
     total = sum(len(hand.tracked) for hand in hands)
     assert [len(hand.tracked) for hand in thinned(hands)] == [len(hand.tracked) for hand in hands]
@@ -171,7 +169,7 @@ def test_thinned_training_frames_are_spread_over_all_hands(
     assert sum(len(hand.tracked) for hand in fewer) <= total // 4 + len(hands)
     assert all(len(hand.tracked) >= 2 for hand in fewer)
     sources = Sources(annotated, checkpoints, HANDS, torch.device("cpu"))
-    errors = diagnose(sources, fingers.predictor.settings, fingers.predict_clip)["manipnet"]
+    errors = diagnose(sources)["manipnet"]
     assert errors["joint_error_nearest_frame_mm"] < errors["joint_error_mean_pose_mm"]
 
 
@@ -272,7 +270,7 @@ def test_a_hinge_joint_rotates_about_its_axis_only_and_points_without_weight_sta
 def test_targets_are_those_of_algorithm_1() -> None:
     # The object is below the plane z = 0. Points: 1 cm deep; 2 cm above and predicted near; 2 cm above, predicted far.
     points = np.array([[0, 0, -0.01], [0, 0, 0.02], [0, 0, 0.02]])
-    nearest = Nearest(points[:, 2], points * [1, 1, 0], np.tile([0.0, 0, 1], (3, 1)))
+    nearest = SignedDistance(points[:, 2], points * [1, 1, 0], np.tile([0.0, 0, 1], (3, 1)))
     radius, range_m = np.array([0.008, 0.008, 0.0]), 0.03
     predicted = np.array([0.0, 0.1, 1.0])  # 8 mm, 11 mm, and the end of the range
     paper = paper_targets(points, predicted, radius, range_m, nearest)
@@ -282,7 +280,7 @@ def test_targets_are_those_of_algorithm_1() -> None:
 def test_our_targets_press_near_points_and_stay_on_the_side_of_the_previous_pose() -> None:
     # The object is below the plane z = 0. Points: 1 cm deep; 2 cm above and predicted near; 2 cm above, predicted far.
     points, surface_points = np.array([[0, 0, -0.01], [0, 0, 0.02], [0, 0, 0.02]]), np.array([[0, 0, 0.01]] * 3)
-    nearest = Nearest(surface_points[:, 2], surface_points * [1, 1, 0], np.tile([0.0, 0, 1], (3, 1)))
+    nearest = SignedDistance(surface_points[:, 2], surface_points * [1, 1, 0], np.tile([0.0, 0, 1], (3, 1)))
     radius, predicted = np.full(3, 0.008), np.array([0.5, 0.1, 1.0])
     arguments = (radius, 0.03, np.array([True, False, False]), radius)
     ours = our_targets(points, predicted, *arguments, nearest)
@@ -294,7 +292,7 @@ def test_our_targets_press_near_points_and_stay_on_the_side_of_the_previous_pose
     assert beyond.point_m[0, 2] == pytest.approx(0.0)
     # Surfaces farther than 6 cm have no effect.
     far = our_targets(
-        points, predicted, *arguments, Nearest(surface_points[:, 2] + 0.06, nearest.closest_m, nearest.normal)
+        points, predicted, *arguments, SignedDistance(surface_points[:, 2] + 0.06, nearest.closest_m, nearest.normal)
     )
     np.testing.assert_allclose(far.point_m, points)
 
@@ -311,7 +309,7 @@ def test_our_rule_moves_fingers_out_of_the_object_and_keeps_the_predicted_pose_a
     depth_m = {}
     for rule in ("off", "ours"):
         rollout = HandRollout(Predictor(network, rule), hand, surface, hand.rest_rotmats)
-        rollout.advance(output, FrameContext(np.zeros(336), object_from_wrist, None))
+        rollout.advance(output, FrameContext(np.zeros((1, 336)), object_from_wrist[None], None))
         np.testing.assert_allclose(rollout.finger_rotmats[0], hand.rest_rotmats, atol=1e-6)
         depth_m[rule] = -surface.nearest(object_from_wrist @ hand.state(rollout.answer).tip_m, None).distance_m.min()
     assert depth_m["off"] > depth_m["ours"] + 0.004
@@ -336,7 +334,7 @@ def test_a_finger_in_a_plate_leaves_it_on_the_side_of_the_previous_pose() -> Non
     output, heights = outputs(hand, within, distance_m, FeatureSettings())[0], []
     for start in (0.2, 0.4):
         rollout = HandRollout(predictor, hand, surface, bent(start))
-        rollout.advance(output, FrameContext(np.zeros(336), object_from_wrist, None))
+        rollout.advance(output, FrameContext(np.zeros((1, 336)), object_from_wrist[None], None))
         heights.append((object_from_wrist @ hand.state(rollout.answer).tip_m)[0, 1, 2])
     assert heights[0] < -0.004
     assert heights[1] > 0.004

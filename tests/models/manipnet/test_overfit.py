@@ -14,15 +14,14 @@ from hoidata.datasets.manipnet.adapter import read_hand_recording
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
-from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.mano_hand import mano_hand
 from models.common.training import TrainingConfig, learning_rate_factor
 from models.manipnet.control import Control, Motion
-from models.manipnet.features import FeatureSettings
+from models.manipnet.family import joint_errors_m
+from models.manipnet.features import FeatureSettings, mirrored_to_right
 from models.manipnet.network import ManipNet, NetworkConfig
-from models.manipnet.retrieval import joint_errors_m, mirrored_to_right
 from models.manipnet.rollout import Predictor, RolloutTask, roll_out
-from models.manipnet.training import NETWORK_ARRAYS, Examples, build_network, hand_examples, perturbed_poses, step_loss
+from models.manipnet.training import Examples, build_network, hand_examples, joined, perturbed_poses, step_loss
 from tests.builders.manipnet import recording_control
 from tests.builders.objects import box_model
 
@@ -89,7 +88,6 @@ def steps_of(stretches: list[Stretch]) -> list[Examples]:
     usable, examples = np.ones(FRAMES, bool), []
     pool = np.concatenate([mirrored_to_right(stretch.hand, stretch.fingers) for stretch in stretches])
     for number, stretch in enumerate(stretches):
-        surface = surface_index(stretch.control.model)
         for start_poses in (None, perturbed_poses(stretch.fingers, mirrored_to_right(stretch.hand, pool), number)):
             arguments = (
                 stretch.control,
@@ -98,7 +96,6 @@ def steps_of(stretches: list[Stretch]) -> list[Examples]:
                 stretch.fingers,
                 stretch.time_s,
                 usable,
-                surface,
                 SETTINGS,
                 start_poses,
             )
@@ -108,9 +105,8 @@ def steps_of(stretches: list[Stretch]) -> list[Examples]:
 
 def fit_examples(network: ManipNet, examples: list[Examples], config: TrainingConfig, seed: int) -> list[float]:
     """Train with Adam on steps in a new random order for each epoch; returns the losses."""
-    inputs, targets = (
-        torch.from_numpy(np.concatenate([getattr(example, name) for example in examples])) for name in NETWORK_ARRAYS
-    )
+    steps = joined(examples)
+    inputs, targets = torch.from_numpy(steps.inputs), torch.from_numpy(steps.outputs)
     generator = torch.Generator().manual_seed(seed)
     optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
     network.train()

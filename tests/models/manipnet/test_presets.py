@@ -17,6 +17,7 @@ from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
+from hoidata.objects.distance import SignedDistance
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.sensors import sense
@@ -32,7 +33,6 @@ from models.manipnet.network import ManipNet, NetworkConfig
 from models.manipnet.rollout import (
     FrameContext,
     HandRollout,
-    Nearest,
     Predictor,
     RolloutTask,
     Rule,
@@ -82,8 +82,8 @@ def scene(body: Motion, right: Motion, model: ObjectModel) -> Control:
 
 def test_the_papers_network_has_2356_inputs_and_220_outputs(own_hand: TrackedHand) -> None:
     state = own_hand.state(own_hand.rest_rotmats[None])
-    control, model = scene(still([0.1, 0, 0]), still([0.0, 0, 0]), box_model()), box_model()
-    inputs = hand_inputs(control, "right", own_hand, state, np.ones(1), SurfaceIndex(model), PAPER)
+    control = scene(still([0.1, 0, 0]), still([0.0, 0, 0]), box_model())
+    inputs = hand_inputs(control, "right", own_hand, state, np.ones(1), PAPER)
     assert [part.shape[1] for part in inputs] == [198, 336, 1822]
     assert outputs(own_hand, state, np.zeros((1, 22)), PAPER).shape == (1, 220)
     config = sized_config(training_plan("paper").network, own_hand)
@@ -159,7 +159,7 @@ def test_the_papers_sensors_measure_at_most_10_cm_on_either_side_now_and_in_half
 def test_algorithm_1_moves_all_joints_predicted_within_2_8_cm_however_far_the_object_is() -> None:
     count = 4
     points = np.tile([0.0, 0, 0.2], (count, 1))
-    nearest = Nearest(points[:, 2], points * [1, 1, 0], np.tile([0.0, 0, 1], (count, 1)))
+    nearest = SignedDistance(points[:, 2], points * [1, 1, 0], np.tile([0.0, 0, 1], (count, 1)))
     predicted_m = np.array([0.0, 0.0279, 0.0281, 0.035])
     target = paper_targets(points, predicted_m / 0.035, np.zeros(count), PAPER.range_m, nearest)
     np.testing.assert_allclose(target.point_m[:, 2], [0.16, 0.2 * 0.0279 + 0.16, 0.2, 0.2])
@@ -181,7 +181,7 @@ def test_the_rule_of_post_processing_is_that_of_the_preset(definition: Literal["
         rollout = HandRollout(Predictor(network, name), hand, SurfaceIndex(box), hand.rest_rotmats)
         # Sec. 6.4: predicted distances are clamped to be non-negative.
         output[-hand.n_points :] = -number
-        rollout.advance(output, FrameContext(np.zeros(336), placed, None))
+        rollout.advance(output, FrameContext(np.zeros((1, 336)), placed[None], None))
         answers[number] = rollout.answer
         # Sec. 6.4: the post-processed pose is the next input.
         assert np.array_equal(rollout.finger_rotmats, rollout.answer) == (rule == "paper")

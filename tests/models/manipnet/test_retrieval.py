@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from models.manipnet.family import NearestFrames, mean_rotmats
 from models.manipnet.features import FeatureSettings
-from models.manipnet.retrieval import NearestFrames, mean_rotmats
 from tests.builders.sensing import random_rotations, small_hand
 
 

@@ -11,14 +11,13 @@ from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
-from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.mano_hand import mano_hand
 from models.manipnet.control import Control, Motion
 from models.manipnet.features import FeatureSettings
 from models.manipnet.network import NetworkConfig
 from models.manipnet.rollout import Predictor, RolloutTask, roll_out
 from models.manipnet.stream import Sample, Stream, TrackedFrame, add_sample, joined_at
-from models.manipnet.training import NETWORK_ARRAYS, build_network, hand_examples, perturbed_poses, step_loss
+from models.manipnet.training import build_network, hand_examples, joined, perturbed_poses, step_loss
 from tests.builders.objects import box_model
 
 HANDS: dict[Side, TrackedHand] = {side: mano_hand(load_embedded_hands(), side) for side in SIDES}
@@ -51,8 +50,8 @@ def predictor(step_s: float) -> Predictor:
     examples = []
     for number, (side, hand) in enumerate(HANDS.items()):
         fingers = hand.rest_rotmats @ rotvec_to_rotmat(0.2 * np.random.default_rng(number).normal(size=(31, 15, 3)))
-        usable, surface = np.ones(31, bool), surface_index(BOX)
-        examples.append(hand_examples(control, side, hand, fingers, time_s, usable, surface, settings))
+        usable = np.ones(31, bool)
+        examples.append(hand_examples(control, side, hand, fingers, time_s, usable, settings))
     config = NetworkConfig(encoder=8, features=settings)
     return Predictor(build_network(config, HANDS["right"], examples).eval())
 
@@ -144,16 +143,15 @@ def trained() -> Predictor:
     """A network that follows smooth fingers, from recorded and from perturbed poses; an untrained one is not steady."""
     torch.manual_seed(0)
     settings, control, time_s = FeatureSettings(step_s=1 / STEP_HZ), tracked(STEP_HZ, 8.0), np.arange(241) / STEP_HZ
-    usable, surface, examples = np.ones(241, bool), surface_index(BOX), []
+    usable, examples = np.ones(241, bool), []
     for number, (side, hand) in enumerate(HANDS.items()):
         bend = np.stack([waves(10 * number + joint, time_s, 0.3) for joint in range(15)], axis=1)
         fingers = hand.rest_rotmats @ rotvec_to_rotmat(bend)
         for start in (None, perturbed_poses(fingers, fingers, number)):
-            examples.append(hand_examples(control, side, hand, fingers, time_s, usable, surface, settings, start))
+            examples.append(hand_examples(control, side, hand, fingers, time_s, usable, settings, start))
     network = build_network(NetworkConfig(encoder=32, features=settings), HANDS["right"], examples)
-    inputs, targets = (
-        torch.from_numpy(np.concatenate([getattr(example, name) for example in examples])) for name in NETWORK_ARRAYS
-    )
+    steps = joined(examples)
+    inputs, targets = torch.from_numpy(steps.inputs), torch.from_numpy(steps.outputs)
     optimiser = torch.optim.Adam(network.parameters(), 2e-3)
     for _ in range(150):
         optimiser.zero_grad()
