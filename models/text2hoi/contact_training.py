@@ -15,6 +15,7 @@ from models.common.augmentation import scaled_contact
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
 from models.common.family import ClipObjective, Losses, Network, Objective, Setup
+from models.common.predicting import spread
 from models.text2hoi.contact import (
     AnchoredContact,
     ContactConfig,
@@ -27,6 +28,7 @@ from models.text2hoi.contact import (
 ContactNetwork = ContactModel | AnchoredContact
 
 DEFAULT_THRESHOLD = 0.5  # without validation clips
+THRESHOLD_CLIPS = 100  # held-out clips that choose a threshold, at most
 THRESHOLDS = tuple(round(0.05 * step, 2) for step in range(1, 20))
 
 
@@ -197,7 +199,7 @@ def _objective(setup: Setup) -> tuple[Objective, None]:
 
 def _results(network: nn.Module, corpus: Corpus) -> dict[str, float]:
     assert isinstance(network, ContactModel | AnchoredContact)
-    held_out = corpus.held_out
+    held_out = spread(corpus.held_out, THRESHOLD_CLIPS)
     if not held_out:
         return {"contact_threshold": DEFAULT_THRESHOLD}
     results = {"contact_threshold": choose_contact_threshold(network, held_out)}

@@ -1,6 +1,8 @@
 """Contact tokens and sampled contact maps: independent of point order, one map per hand, several modes."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,8 @@ from torch import Tensor
 from hoidata.batches.dataset import ClipBatch
 from hoidata.contact.maps import f1_score
 from models.common.point_net import PointNetConfig, spread_out
-from models.text2hoi.contact import AnchoredContact, ContactConfig, by_hand_loss, sample_indices
+from models.text2hoi import contact_training
+from models.text2hoi.contact import AnchoredContact, ContactConfig, ContactModel, by_hand_loss, sample_indices
 from models.text2hoi.contact_training import most_typical
 from models.text2hoi.diffusion import TOKEN_FEATURES, contact_tokens
 
@@ -93,6 +96,14 @@ def test_a_hand_inactive_in_the_whole_batch_is_skipped_without_effect(batch: Cli
     whole, after = model.sample(*arguments), len(calls)
     torch.testing.assert_close(model.sample(replace(arguments[0], sides=(False, True)), *arguments[1:]), whole)
     assert len(calls) - after < after
+
+
+@pytest.mark.parametrize(("clips", "used"), [(250, 100), (7, 7)])
+def test_thresholds_are_chosen_on_at_most_100_clips(monkeypatch: pytest.MonkeyPatch, clips: int, used: int) -> None:
+    monkeypatch.setattr(contact_training, "choose_contact_threshold", lambda network, held_out: len(held_out))
+    held_out: Any = SimpleNamespace(held_out=list(range(clips)))
+    results = contact_training.CONTACT.results(ContactModel(ContactConfig()), held_out)
+    assert results == {"contact_threshold": used}
 
 
 def test_the_medoid_has_the_best_mean_f1_with_the_others() -> None:
