@@ -74,7 +74,7 @@ def main() -> None:
     calls |= {title: one_motion(family, sources, request) for title, family, _ in METHODS}
     by_diffusion = {title for title, _, diffusion in METHODS if diffusion}
     times = medians(calls, RUNS)
-    # The refiner and the contact map are not part of the denoising steps; both take a few hundredths of it.
+    # Refiner and contact map are not denoising steps, but take only hundredths of the time.
     rows = [
         [
             title,

@@ -281,8 +281,8 @@ class _Writer:
     def _add_contact(self, contact: SourceContact | None) -> dict[str, Any]:
         if contact is None:
             return {"source_contact_row": -1, "source_contact_count": 0}
-        row = self.shards.append_all(SOURCE_CONTACT, vars(contact))
-        return {"source_contact_row": row, "source_contact_count": len(contact.frame)}
+        first_row = self.shards.append_all(SOURCE_CONTACT, vars(contact))
+        return {"source_contact_row": first_row, "source_contact_count": len(contact.frame)}
 
     def finish(self, info: dict[str, Any]) -> dict[str, int]:
         self.shards.finish()

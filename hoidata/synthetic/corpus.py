@@ -67,8 +67,8 @@ def make_corpus(
     if size in ("full", "small"):
         generated = run(make_action, tasks_of(dataset, seed, size), "making")
     else:
-        found = run(find_grasps, pool_tasks(dataset, seed, size), "grasps")
-        pools = {(task.object_index, task.region): grasps for task, grasps in found}
+        grasps_of_tasks = run(find_grasps, pool_tasks(dataset, seed, size), "grasps")
+        pools = {(task.object_index, task.region): grasps for task, grasps in grasps_of_tasks}
         generated = run(make_clips, clip_tasks(dataset, seed, size, pools), "making")
     return place_in_raw_sequences(dataset, [pair for _, pairs in generated for pair in pairs])
 

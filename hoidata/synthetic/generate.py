@@ -45,8 +45,8 @@ def make_action(task: _Task) -> list[tuple[int, TruthSequence]]:
     rng = np.random.default_rng([task.seed, DATASET_IDS[task.dataset], _POOL_STREAM, task.action])
     betas = np.stack([person.betas for person in people])
     pool = search_pool(Scene(spec, model, action.grasp.hinge_rad), action.grasp, pair, betas, rng)
-    found = dict(zip(names, zip(people, pool, strict=True), strict=True))
-    return [(position, _sound_sequence(task, entry, *found[entry.subject], pair)) for position, entry in task.entries]
+    drawn = dict(zip(names, zip(people, pool, strict=True), strict=True))
+    return [(position, _sound_sequence(task, entry, *drawn[entry.subject], pair)) for position, entry in task.entries]
 
 
 def _number(subject: str) -> int:
@@ -79,8 +79,8 @@ def _sound_sequence(
         truth = make_sequence(dataset, action, spec, model, grip, person, key, length, pair, play, rng)
         if measure(truth, pair).is_sound:
             return truth
-    what = f"{action.verb} {action.object_name} by {entry.subject}"
-    raise HoidataError(f"{dataset}: {what} is not plausible after {_ATTEMPTS} attempts")
+    action_words = f"{action.verb} {action.object_name} by {entry.subject}"
+    raise HoidataError(f"{dataset}: {action_words} is not plausible after {_ATTEMPTS} attempts")
 
 
 _ARCTIC_KINDS = ("use", "grab")

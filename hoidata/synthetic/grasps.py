@@ -460,6 +460,6 @@ def _for_subjects(
     entries = []
     for index, scores in enumerate(score):
         rows = [index * n_subjects + subject if scores[subject] > 0 else None for subject in range(n_subjects)]
-        grips = [None if row is None else tuple(to_grip(scene, *reach, row) for reach in reaches) for row in rows]
+        grips = [None if pose is None else tuple(to_grip(scene, *reach, pose) for reach in reaches) for pose in rows]
         entries.append((scores, grips))
     return entries

@@ -167,8 +167,8 @@ def _sound_clip(task: ClipTask, entry: StudyEntry, pair: HandPair) -> TruthSeque
             truth = make_study_sequence(scenario, contact_frames, pair, _PLAYS[attempt // len(grasps)], rng)
             if measure(truth, pair).is_sound:
                 return truth
-    what = f"{entry.verb} {study_object.spec.name} by {entry.subject} with {entry.hand}"
-    raise HoidataError(f"{dataset}: {what}: no plausible clip")
+    action_words = f"{entry.verb} {study_object.spec.name} by {entry.subject} with {entry.hand}"
+    raise HoidataError(f"{dataset}: {action_words}: no plausible clip")
 
 
 def _handovers(

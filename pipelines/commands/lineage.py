@@ -99,11 +99,11 @@ def diff(
     from pipelines.lineage.targets import find_target
 
     targets = [find_target(root, name, here) for name in (first, second)]
-    where = "hoidata lineage diff"
+    command = "hoidata lineage diff"
     if any(target.kind == "motion" for target in targets):
-        raise BadInput(where, "two checkpoints, stores or metric files", "a motion", "name its checkpoints")
+        raise BadInput(command, "two checkpoints, stores or metric files", "a motion", "name its checkpoints")
     if targets[0].is_of_lock != targets[1].is_of_lock:
-        raise BadInput(where, "two files of one kind", "a checkpoint and another file", "name two of one kind")
+        raise BadInput(command, "two files of one kind", "a checkpoint and another file", "name two of one kind")
     causes = differences(root, *(target.record for target in targets))
     for line in causes or ["no recorded cause differs"]:
         typer.echo(line)

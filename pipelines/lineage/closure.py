@@ -200,7 +200,9 @@ def _read_imports(path: Path) -> dict[str, list[Statement]]:
     try:
         values = json.loads(path.read_bytes())
         imports = values["imports"].items() if values["scanner"] == sha256_file(__file__) else ()
-        return {digest: [(base, int(level), list(names)) for base, level, names in found] for digest, found in imports}
+        return {
+            digest: [(base, int(level), list(names)) for base, level, names in modules] for digest, modules in imports
+        }
     except (OSError, ValueError, TypeError, AttributeError, KeyError):
         return {}
 

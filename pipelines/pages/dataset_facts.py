@@ -47,7 +47,7 @@ def read_dataset(root: Path, name: str, hands: HandPair) -> DatasetFacts:
     if not (root / "clips" / "meta" / "info.json").is_file():
         return DatasetFacts(name, empty=reason or "it was not converted")
     store = open_store(root / "clips", hands)
-    quarantine = [tuple(map(str, row)) for row in store.quarantine.itertuples(index=False)]
+    quarantine = [tuple(map(str, entry)) for entry in store.quarantine.itertuples(index=False)]
     if not len(store):
         empty = reason or "no sequence gave a clip"
         return DatasetFacts(name, empty=empty, quarantine=quarantine, info=store.info)

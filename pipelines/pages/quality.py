@@ -73,7 +73,7 @@ def read_quality(folder: Path, dataset: str) -> QualityFacts | None:
         chart=Markup(measures_svg(clips, CLIP_MEASURES, limits, f"{dataset} quality")),
         failed=[(name, why) for name, verdict, why in judged if verdict == "left out"],
         warned=[(name, why) for name, verdict, why in judged if verdict == "warned"],
-        unsound=[row for row in meshes[["object", "verdict", "reasons"]].to_numpy().tolist() if row[1] != "ok"],
+        unsound=[mesh for mesh in meshes[["object", "verdict", "reasons"]].to_numpy().tolist() if mesh[1] != "ok"],
         notes=sorted(Counter(note for note in clips["note"].tolist() if note).items()),
         unmeasured=[(measure.words, measure.unmeasured, count) for measure, count in missing.items() if count],
     )
