@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-CEILING = 159  # hits in all tracked files
+CEILING = 152  # hits in all tracked files
 ALLOWED = frozenset({"promises"})
 
 # Patterns of prose and the standard terms to use instead.
