@@ -34,10 +34,10 @@ app.add_typer(adapters.app, name="adapters", help="List the dataset adapters, or
 app.add_typer(raw.app, name="raw", help="Scan your raw files into a manifest, or verify them.")
 app.add_typer(lineage.app, name="lineage")
 for command in (
-    *(init.init, adapters.convert, graph.repro, graph.up, graph.down, inspect.doctor, inspect.info, inspect.validate),
-    *(raw.profile, settings.settings, share.share, evaluate.evaluate, evaluate.compare, evaluate.controls),
-    *(evaluate.table, motions.generate, motions.animate, motions.stream, motions.hands, show.show, export.export),
-):
+    init.init, adapters.convert, graph.repro, graph.up, graph.down, inspect.doctor, inspect.info, inspect.validate,
+    raw.profile, settings.settings, share.share, evaluate.evaluate, evaluate.compare, evaluate.controls,
+    evaluate.table, motions.generate, motions.animate, motions.stream, motions.hands, show.show, export.export,
+):  # fmt: skip
     app.command()(command)
 
 

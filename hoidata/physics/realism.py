@@ -38,7 +38,7 @@ class StandardUnits:
     limit: ClassVar[float] = RESIDUAL_LIMIT  # of the residual's norm, N and N m
     at_centre: ClassVar[bool] = False
 
-    def residuals(self, scene: Scene, contacts: "CapsuleContacts | TableContacts") -> np.ndarray:
+    def residuals(self, scene: Scene, contacts: "CapsuleContacts | WorldContacts") -> np.ndarray:
         """(frame,) norm of the residual wrench after the best contact forces."""
         arms = contacts.point_m - scene.motion.centre_m[contacts.frame]
         columns, offsets = force_columns(contacts.frame, arms, cone_edges(contacts.normal, FRICTION), scene.n_frames)
@@ -196,8 +196,8 @@ def score(scene: Scene, variant: Variant, frames: np.ndarray | None = None) -> R
     )
 
 
-class TableContacts(NamedTuple):
-    """Contacts in the world frame of an object on the table."""
+class WorldContacts(NamedTuple):
+    """Contacts with an object in the world frame."""
 
     frame: np.ndarray  # (contact,) int
     point_m: np.ndarray  # (contact, 3)
@@ -211,16 +211,16 @@ def every_frame_passes(scene: Scene, frames: np.ndarray) -> np.ndarray:
     """
     hands, table = contacts_in(scene, frames), table_contacts(scene, np.flatnonzero(frames & ~scene.lifted))
     columns = zip((hands.frame, hands.point_m, hands.normal), table, strict=True)
-    contacts = TableContacts(*(np.concatenate(column) for column in columns))
+    contacts = WorldContacts(*(np.concatenate(column) for column in columns))
     passed = StandardUnits().residuals(scene, contacts) < StandardUnits.limit
     passed[hands.frame[hands.depth_m >= LARGEST_PENETRATION_M]] = False
     return passed[frames]
 
 
-def table_contacts(scene: Scene, frames: np.ndarray) -> TableContacts:
+def table_contacts(scene: Scene, frames: np.ndarray) -> WorldContacts:
     """Contacts with the table in frames (frame,) int: the outermost of the object's lowest vertices."""
     model, poses = scene.model, scene.poses.taken(frames)
-    side, other = np.linalg.svd(scene.gravity[None])[2][1:]
+    side, other = np.linalg.svd(scene.gravity[None])[2][1:]  # horizontal unit vectors
     angles = 2 * np.pi * np.arange(_TABLE_CORNERS) / _TABLE_CORNERS
     directions = np.outer(np.cos(angles), side) + np.outer(np.sin(angles), other)
     parts = [(poses.world_from_part(model, part), model.vertices_of(part)) for part in model.parts]
@@ -231,7 +231,7 @@ def table_contacts(scene: Scene, frames: np.ndarray) -> TableContacts:
         points.append(touching[np.unique((touching @ directions.T).argmax(axis=0))])
     counts = [len(rows) for rows in points]
     point = np.concatenate([np.zeros((0, 3)), *points])
-    return TableContacts(np.repeat(frames, counts), point, np.broadcast_to(scene.gravity, point.shape))
+    return WorldContacts(np.repeat(frames, counts), point, np.broadcast_to(scene.gravity, point.shape))
 
 
 def contacts_in(scene: Scene, frames: np.ndarray) -> CapsuleContacts:

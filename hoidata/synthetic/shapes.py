@@ -110,7 +110,7 @@ def _ring_quads(n_rings: int, sections: int, wrap: bool) -> np.ndarray:
     following = (current + 1) % sections
     above = (ring + 1) % n_rings
     pairs = ((ring, current), (ring, following), (above, following), (above, current))
-    corners = [row * sections + column for row, column in pairs]
+    corners = [ring_number * sections + position for ring_number, position in pairs]
     return np.stack(np.broadcast_arrays(*corners), axis=-1).reshape(-1, 4)
 
 

@@ -46,7 +46,7 @@ class Target:
 def find_target(root: Path | None, path_or_digest: str, here: Path | None = None) -> Target:
     """The file with a path (relative to ``here``), or a digest that begins with these eight or more characters.
 
-    Raises BadInput if there is no such file, or no record of its inputs.
+    Raises BadInput without such a file or without a record of its inputs.
     """
     path = (here or Path()) / path_or_digest
     if path.exists():

@@ -14,9 +14,9 @@ from hoidata.lifetime import end_with_process, run_interruptibly
 from pipelines.warm import ENVIRONMENT, run_warm
 
 STAGES = (
-    *("code", "raw", "convert", "quality", "annotate", "contact", "split"),
-    *("evaluator", "train", "sample", "controls", "evaluate", "report"),
-)
+    "code", "raw", "convert", "quality", "annotate", "contact", "split",
+    "evaluator", "train", "sample", "controls", "evaluate", "report",
+)  # fmt: skip
 
 
 def main() -> int:
