@@ -1,6 +1,7 @@
 """The stores that ``generate``, ``animate``, ``stream`` and ``hands`` write fit every export, page and metric."""
 
 import json
+import shutil
 import socket
 import threading
 from collections.abc import Mapping
@@ -26,6 +27,7 @@ from models.registry import load_network
 from pipelines import command_inputs
 from pipelines.cli import app
 from pipelines.command_inputs import write_motion_store
+from pipelines.exports.spider import TIPS
 from tests.builders.clips import build_clip
 from tests.builders.stores import write_annotated
 from tests.builders.udp import free_port, send_when_open
@@ -126,6 +128,38 @@ def test_every_export_of_every_store_is_read_by_its_own_library(command, form, s
             np.testing.assert_allclose(joints_m, store.joints(clip_id, side), atol=1e-4)
         track = store.clip(clip_id).object
         np.testing.assert_allclose(world_from_object[:, :3, 3], track.translation_m, atol=1e-4)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_spider_gets_tips_and_mesh_of_every_store(command, stores, tmp_path) -> None:
+    store = open_store(stores[command])
+    typed("export", store.folder, "--to", "spider", "--out", tmp_path / "spider", "--for-own-use")
+    tasks = sorted((tmp_path / "spider").rglob("task_info.json"))
+    assert len(tasks) == len(store)
+    for clip_id, path in zip(sorted(store.ids), tasks, strict=True):
+        arrays, track = load_npz_arrays(path.parent / "0" / "trajectory_keypoints.npz"), store.clip(clip_id).object
+        from_object_m = arrays["qpos_finger_right"][:, :, :3] - arrays["qpos_obj_right"][:, None, :3]
+        expected_m = store.joints(clip_id, "right")[:, list(TIPS)] - track.translation_m[:, None]
+        # Distances do not depend on the world's axes, which SPIDER needs z up.
+        np.testing.assert_allclose(*(np.linalg.norm(m, axis=-1) for m in (from_object_m, expected_m)), atol=1e-5)
+        folder = json.loads(path.read_text())["right_object_mesh_dir"]
+        mesh: Any = trimesh.load(tmp_path / "spider" / folder / "visual.obj", process=False)
+        np.testing.assert_allclose(
+            mesh.bounds, [track.model.vertices_m.min(0), track.model.vertices_m.max(0)], atol=1e-5
+        )
+
+
+@pytest.mark.filterwarnings("ignore:ConjunctiveGraph is deprecated", "ignore:The inplace keyword")  # of mlcroissant
+@pytest.mark.parametrize("command", COMMANDS)
+def test_croissant_reads_the_tables_of_every_store(command, stores, tmp_path) -> None:
+    mlcroissant = pytest.importorskip("mlcroissant", reason="the extra croissant, which pyright must not see")
+    folder = shutil.copytree(stores[command], tmp_path / "store")
+    typed("export", folder, "--to", "croissant", "--out", tmp_path / "export", "--for-own-use")
+    shutil.copy(tmp_path / "export" / "croissant.json", folder)
+    dataset = mlcroissant.Dataset(jsonld=folder / "croissant.json")
+    assert not dataset.metadata.ctx.issues.errors
+    ids = [row["meta_sequences/clip_id"].decode() for row in dataset.records("meta_sequences")]
+    assert ids == open_store(folder).ids
 
 
 @pytest.mark.parametrize("command", COMMANDS)
