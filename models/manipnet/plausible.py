@@ -31,7 +31,7 @@ MAX_FRACTION = 0.5  # of a hand's near frames that may violate a limit
 PALM_DIRECTION = np.array([0.8, 0.0, -0.6])  # from the wrist to a grasped object, canonical axes
 PER_PALM_M, PER_SPREAD_M, PER_SPREAD_RAD = 10.0, 5.0, 0.5  # penalty per palm distance and spread of the pose
 MIN_SCORE, MIN_GAIN = -2.0, 0.3  # the best score is 2
-MIN_ALIGNMENT = 0.6
+MIN_ALIGNMENT = 0.6  # of the palm; recorded hands have at least 0.8, with other wrist axes at most 0.3
 MAX_CHECKED_FRAMES = 10_000  # longer files are thinned evenly
 
 
@@ -58,34 +58,32 @@ class Reading(NamedTuple):
     def active(self) -> list[Side]:
         return [side for side in SIDES if self.nearest_m.get(side, np.inf) < NEAR_M]
 
-    @property
-    def is_good(self) -> bool:
-        """Whether it has no fault and the palm of some near hand faces the object."""
-        return self.fault is None and max(self.fits[side].alignment for side in self.active) > MIN_ALIGNMENT
-
     def gain_over(self, other: "Reading") -> float:
         """By how much the scores of this reading's near hands exceed those of the other reading."""
         return sum(self.fits[side].score - other.fits[side].score for side in self.active)
 
 
 def plausible_reading(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, TrackedHand]) -> Reading:
-    """The file as given. Raises BadInput if it is implausible; the remedy names the change that makes it plausible."""
+    """The file as given. Raises BadInput if it is implausible; the remedy names the probable changes."""
     as_given = reading(file, model, hands)
-    alternatives = [(fault, reading(changed_file, model, hands)) for fault, changed_file in _other_conventions(file)]
-    alternatives = [item for item in alternatives if item[1].is_good]
-    alternatives.sort(key=lambda item: -item[1].gain_over(as_given))
-    if as_given.fault is None:
-        # A plausible file is refused only if an alternative fits clearly better.
-        if alternatives and alternatives[0][1].gain_over(as_given) > MIN_GAIN:
-            raise alternatives[0][0]
+    fault, gain = as_given.fault, -np.inf
+    if not file.is_calibrated:  # rotations then are no longer those of the file
+        reordered = reading(file.with_bodies(_reordered), model, hands)
+        gain = reordered.gain_over(as_given) if reordered.fault is None else gain
+    if fault is None and gain <= MIN_GAIN:
         return as_given
-    plausible_units = [unit for unit, scaled_file in _other_units(file) if reading(scaled_file, model, hands).is_good]
-    if alternatives and not plausible_units:
-        raise alternatives[0][0]
-    remedy = as_given.fault.remedy
-    if plausible_units:
-        remedy = f"perhaps the positions have another unit: --trajectory-unit {' or '.join(plausible_units)}"
-    raise BadInput(file.source, as_given.fault.expected, as_given.fault.got, remedy)
+    units = [unit for unit, scaled in _other_units(file) if fault and reading(scaled, model, hands).fault is None]
+    if fault is None or (gain > -np.inf and not units):
+        got = "hands that fit the object only in the order x, y, z, w"
+        fault = BadInput(file.source, "quaternions in the order w, x, y, z", got, "put w first")
+    remedy = fault.remedy
+    if units:
+        remedy = f"perhaps the positions have another unit: --trajectory-unit {' or '.join(units)}"
+    elif file.is_calibrated:
+        remedy += "; or record the calibration again"
+    elif as_given.fault and file.unit:
+        remedy += "; or the wrists have other axes: name them (--wrist-axes) or measure them (--calibration)"
+    raise BadInput(file.source, fault.expected, fault.got, remedy)
 
 
 def reading(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, TrackedHand]) -> Reading:
@@ -96,7 +94,8 @@ def reading(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, Track
     placed_hands: dict[Side, _PlacedHand] = {side: _PlacedHand(thinned, side, hands[side]) for side in file.wrists}
     nearest: dict[Side, float] = {side: float(placed.palm_distance_m.min()) for side, placed in placed_hands.items()}
     fits: dict[Side, Fit] = {side: placed.fit() for side, placed in placed_hands.items()}
-    return Reading(control, nearest, fits, _far(file, nearest) or _inside(file, placed_hands))
+    fault = _far(file, nearest) or _inside(file, placed_hands) or _turned_away(file, fits, nearest)
+    return Reading(control, nearest, fits, fault)
 
 
 def _control(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, TrackedHand]) -> Control:
@@ -176,6 +175,15 @@ def _far(file: TrajectoryFile, nearest_m: Mapping[Side, float]) -> BadInput | No
     return BadInput(file.source, expected, got, "check the positions and their unit")
 
 
+def _turned_away(file: TrajectoryFile, fits: Mapping[Side, Fit], nearest_m: Mapping[Side, float]) -> BadInput | None:
+    """The fault of near palms of which none faces the object."""
+    alignment = max(fit.alignment for side, fit in fits.items() if nearest_m[side] < NEAR_M)
+    if alignment > MIN_ALIGNMENT:
+        return None
+    expected = f"a palm that faces the object, with a cosine above {MIN_ALIGNMENT}"
+    return BadInput(file.source, expected, f"at most {alignment:.2g}", "check the origin and axes of the mesh")
+
+
 def _inside(file: TrajectoryFile, placed_hands: Mapping[Side, _PlacedHand]) -> BadInput | None:
     """The fault of a palm deep in the object, or a wrist in its convex hull, in most near frames."""
     for side, placed in placed_hands.items():
@@ -211,18 +219,6 @@ def _hull_faces(model: ObjectModel, part: int) -> np.ndarray:
     inward = (normal * hull.equations[:, :3]).sum(axis=1) < 0
     simplices = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices)
     return vertex_ids[simplices].astype(part_faces.dtype)
-
-
-def _other_conventions(file: TrajectoryFile) -> Iterator[tuple[BadInput, TrajectoryFile]]:
-    """The file with other wrist axes and with quaternions in the order x, y, z, w, each with the fault to report."""
-    if file.unit:
-        other = "model" if file.axes == "canonical" else "canonical"
-        got = f"hands that fit the object only in the axes of --wrist-axes {other}"
-        fault = BadInput(file.source, f"wrists in the axes of --wrist-axes {file.axes}", got, f"--wrist-axes {other}")
-        yield fault, replace(file, axes=other)
-    got = "hands that fit the object only in the order x, y, z, w"
-    fault = BadInput(file.source, "quaternions in the order w, x, y, z", got, "put w first")
-    yield fault, file.with_bodies(_reordered)
 
 
 def _reordered(body: Motion) -> Motion:
