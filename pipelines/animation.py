@@ -4,7 +4,7 @@ import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from functools import partial
 from os.path import isfile  # returns False for a name that is too long, where Path.is_file raises
 from pathlib import Path
@@ -34,6 +34,7 @@ from models.manipnet.animate import (
     predict_fingers,
     with_fingers,
 )
+from models.manipnet.calibration import calibrated_file, calibrated_frame, offsets_of
 from models.manipnet.control import Control, control_from_clip, hands_of
 from models.manipnet.datagrams import Tracker, parse_address, pose_line
 from models.manipnet.network import ManipNet
@@ -74,6 +75,7 @@ class AnimationOptions:
     unit: str = ""  # of positions in a file of trajectories
     axes: Axes = "model"  # of the wrists in a file of trajectories
     up: str = ""  # of a file of trajectories: the world axis that points up
+    calibration: str = ""  # a recording of flat hands that gives the offsets of trackers from the wrists
     mesh: MeshOptions = field(default_factory=MeshOptions)
     method: Method = "auto"  # of filling frames of a clip; "auto" chooses by their number
 
@@ -84,9 +86,11 @@ class AnimationOptions:
             "--trajectory-unit": self.unit,
             "--wrist-axes": "" if self.axes == "model" else self.axes,
             "--world-up": self.up,
+            "--calibration": self.calibration,
             "--unit": self.mesh.unit,
             "--hinge": self.mesh.hinge,
             "--moving": self.mesh.moving,
+            "--scale": "" if self.mesh.scale == 1 else self.mesh.scale,
         }
         for option, value in file_options.items():
             if value:
@@ -99,6 +103,8 @@ class AnimationOptions:
         if self.method == "interpolate":
             remedy = "omit it: a file of trajectories has no poses to interpolate between"
             raise BadInput("--way", "network or auto with a file of trajectories", self.method, remedy)
+        if self.calibration and self.axes != "model":
+            raise BadInput("--wrist-axes", "none with --calibration, which measures them", self.axes, "omit it")
         if self.up not in UPS:
             raise BadInput("--world-up", "x, y or z", self.up, "name the axis of the file's world that points up")
 
@@ -374,7 +380,13 @@ def _from_tracker(
     mean_hands, predictor = hands_of(project.hands, np.zeros((2, 10), np.float32), None), network.predictor
     hands: dict[Side, TrackedHand] = {side: mean_hands[side] for side in options.sides}
     tracker = Tracker(address, model.is_articulated, report)
-    frames, poses = _played(predictor, hands, model, tracker.frames(), show)
+    tracked = tracker.frames()
+    if options.calibration:
+        recording = read_trajectories(Path(options.calibration))
+        offsets, offset_notes = offsets_of(recording, mean_hands, options.sides)
+        notes += offset_notes
+        tracked = (calibrated_frame(frame, offsets) for frame in tracked)
+    frames, poses = _played(predictor, hands, model, tracked, show)
     notes.append(f"{tracker.refused} of {tracker.received} datagrams were refused")
     control, valid = control_of_frames(frames, model)
     if control is None or not valid[[side in hands for side in SIDES]].any():
@@ -396,6 +408,11 @@ def _from_file(
     network = chosen_network(options, project)
     model, notes = _object(options, options.mesh.unit or trajectories.mesh_unit, project)
     mean_hands = hands_of(project.hands, np.zeros((2, 10), np.float32), None)
+    if options.calibration:
+        recording = read_trajectories(Path(options.calibration), options.unit)
+        offsets, offset_notes = offsets_of(recording, mean_hands, set(options.sides) & set(trajectories.wrists))
+        notes += offset_notes
+        trajectories = calibrated_file(trajectories, offsets)
     given = control_from_file(trajectories, model, mean_hands)
     notes += [*given.notes, *_skipped_hand_notes(trajectories, given, options.sides)]
     control = at_30_fps(given.control)
@@ -425,12 +442,12 @@ def _object(options: AnimationOptions, unit: str, project: ProjectData) -> tuple
     """A mesh file in its stored axes, or an object of the dataset; and notes for the user."""
     if is_object_path(options.object):
         # The trajectories give the mesh's orientation, so the mesh is not rotated upright.
-        user = read_user_object(Path(options.object), unit, "z", options.mesh.hinge, options.mesh.moving)
+        user = read_user_object(Path(options.object), *astuple(replace(options.mesh, unit=unit, up="z")))
         return user.model, list(user.notes)
     if not options.object:
         raise BadInput("--object", "the mesh of the object (.obj, .ply, .stl, .glb)", "none", "name it")
     paths = StagePaths(project.profile, options.model or project.datasets[0])
-    return stored_object(options.object, paths.clips, project.hands), []
+    return stored_object(options.object, paths.clips, project.hands).scaled(options.mesh.scale), []
 
 
 def chosen_network(options: AnimationOptions, project: ProjectData) -> Network:

@@ -31,6 +31,10 @@ MeshHinge = Annotated[
     typer.Option(help="Hinge of a mesh of two pieces, 'px,py,pz dx,dy,dz': point and direction; a slide: direction."),
 ]
 Moving = Annotated[str, typer.Option(help="What moves: joint of a URDF, or pieces of a mesh with --hinge.")]
+Calibration = Annotated[
+    str, typer.Option(help="A recording of flat hands that calibrates trackers to the wrists (docs/fingers.md).")
+]
+Scale = Annotated[float, typer.Option(help="Factor on the size of a mesh file.", min=0.1, max=10)]
 Profile = Annotated[str, typer.Option(help="Profile: embedded, study or own. Default: the one in params.yaml.")]
 MESH = "A mesh file (OBJ, PLY, STL, GLB), a URDF or its folder, or a dataset's object."
 Object = Annotated[str, typer.Option("--object", help=MESH)]
@@ -119,6 +123,7 @@ def generate(
     up: Up = "",
     hinge: MeshHinge = "",
     moving: Moving = "",
+    scale: Scale = 1.0,
     hand_by: HandBy = None,
     profile: Profile = "",
     encoder: Encoder = "",
@@ -128,10 +133,11 @@ def generate(
     from hoidata.objects.user_mesh import is_object_path
 
     mesh = Path(object).resolve() if is_object_path(object) else None
+    of_mesh = {"--unit": unit, "--up": up, "--hinge": hinge, "--moving": moving, "--scale": scale != 1}
     _refuse_ineffective(
         {"--model": models and model, "--profile": models and profile, "--encoder": not models and encoder}
         | {"--hand-by": hand and hand_by}
-        | ({} if mesh or Path(object).suffix else {"--unit": unit, "--up": up, "--hinge": hinge, "--moving": moving})
+        | ({} if mesh or Path(object).suffix else of_mesh)
     )
     project = ("", ()) if models else _project(profile)
     from hoidata.clips.clip import FPS
@@ -152,7 +158,7 @@ def generate(
         model=model,
         models=_models_in(models, encoder) if models else None,
         options=MotionOptions(seed=seed, samples=samples, hand=hand, frames=frames, hand_by=hand_by),
-        mesh=MeshOptions(unit, up, hinge, moving),
+        mesh=MeshOptions(unit, up, hinge, moving, scale),
         sampler=of_sampler,
         sampling=of_sampling,
         force=force,
@@ -167,7 +173,7 @@ def _refuse_ineffective(options: Mapping[str, Any]) -> None:
 
         expected = (
             "--model and --profile in a project, --encoder with --models, --hand-by without --hand, --unit, --up, "
-            "--hinge and --moving with an existing mesh file"
+            "--hinge, --moving and --scale with an existing mesh file"
         )
         raise BadInput(", ".join(ineffective), expected, "an option that has no effect here", "omit it")
 
@@ -215,10 +221,12 @@ def animate(
             help="Wrist axes in .csv and .npz files: the hand model's, or canonical (x to the fingers, y to the thumb)."
         ),
     ] = "model",
+    calibration: Calibration = "",
     world_up: WorldUp = "",
     unit: MeshUnit = "",
     hinge: MeshHinge = "",
     moving: Moving = "",
+    scale: Scale = 1.0,
     way: Annotated[
         Literal["auto", "network", "interpolate"],
         typer.Option(
@@ -228,7 +236,7 @@ def animate(
     profile: Profile = "",
 ) -> None:
     """Generate finger motion for given wrist and object trajectories; write arrays, an animated GLB and a web page."""
-    source, object = map(_absolute, (source, object))
+    source, object, calibration = map(_absolute, (source, object, calibration))
     project = _project(profile)
     from hoidata.clips.clip import SIDES
     from pipelines.animation import AnimationOptions, animate_files
@@ -243,7 +251,8 @@ def animate(
         unit=trajectory_unit,
         axes=wrist_axes,
         up=world_up,
-        mesh=MeshOptions(unit, "", hinge, moving),
+        calibration=calibration,
+        mesh=MeshOptions(unit, "", hinge, moving, scale),
         method=way,
     )
     _print_written(animate_files(source, options, *project, out, store))
@@ -261,16 +270,18 @@ def stream(
     fast: Annotated[bool, typer.Option("--fast", help="Do not wait for the times of a file.")] = False,
     fingers: Fingers = "both",
     model: Annotated[str, typer.Option(help="Dataset whose network to use. Default: the first with a network.")] = "",
+    calibration: Calibration = "",
     world_up: WorldUp = "",
     unit: MeshUnit = "",
     hinge: MeshHinge = "",
     moving: Moving = "",
+    scale: Scale = 1.0,
 ) -> None:
     """Stream fingers live for a file, at its recorded speed, or for a tracker.
 
     Prints a pose per line: time_s, axis-angles (15, 3) of each hand. Then writes what `animate` does.
     """
-    object = _absolute(object)
+    object, calibration = map(_absolute, (object, calibration))
     source = source if "://" in source else str(Path(source).absolute())
     project = _project("")
     from hoidata.clips.clip import SIDES
@@ -282,7 +293,8 @@ def stream(
         model=model,
         object=object,
         up=world_up,
-        mesh=MeshOptions(unit, "", hinge, moving),
+        calibration=calibration,
+        mesh=MeshOptions(unit, "", hinge, moving, scale),
     )
 
     report = partial(typer.echo, err=True)
@@ -310,6 +322,7 @@ def hands(
     up: Up = "",
     hinge: MeshHinge = "",
     moving: Moving = "",
+    scale: Scale = 1.0,
     hinge_range: Annotated[
         str,
         typer.Option(
@@ -332,7 +345,7 @@ def hands(
         keyframes=keyframes,
         clip=clip,
         motion=motion,
-        mesh=MeshOptions(unit, up, hinge, moving),
+        mesh=MeshOptions(unit, up, hinge, moving, scale),
         hinge_range=hinge_range,
         hand=hand,
         samples=samples,

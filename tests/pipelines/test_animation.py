@@ -1,5 +1,7 @@
 """`hoidata animate` with the commands of docs/fingers.md, in a tiny project with a tiny network, and its messages."""
 
+import json
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,15 +14,18 @@ from typer.testing import CliRunner
 
 from hoidata.clips.clip import Clip
 from hoidata.errors import BadInput
+from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.sensors.mano_hand import mano_hand
 from models.common.training import train_network
+from models.manipnet.calibration import sheet_from_wrist
 from models.manipnet.training import MANIPNET
 from models.manipnet.trajectory_files import PARTS
 from pipelines.cli import app
 from tests.builders.clips import build_clip
 from tests.builders.stores import write_annotated
+from tests.builders.udp import free_port, send_when_open
 
 HAND = mano_hand(load_embedded_hands(), "right")
 pytestmark = pytest.mark.slow  # a network is trained, and sensors are compiled
@@ -73,6 +78,7 @@ def write_user_files(folder: Path) -> None:
     trimesh.creation.box(np.array(BOX_M) * 10).export(folder / "cyl_med.obj")
     (folder / "mine.csv").write_text(csv_text(HAND))
     (folder / "demo1.txt").write_text(manipnet_text())
+    write_tracker_files(folder)
 
 
 def object_and_wrist_poses(wrist_axes: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -87,15 +93,33 @@ def object_and_wrist_poses(wrist_axes: np.ndarray) -> list[tuple[np.ndarray, np.
 
 
 def csv_text(hand: TrackedHand) -> str:
-    rows = object_and_wrist_poses(hand.wrist_from_canonical.T)
+    return table(object_and_wrist_poses(hand.wrist_from_canonical.T))
+
+
+def table(rows: list[tuple[np.ndarray, np.ndarray]]) -> str:
+    """A table of object and right wrist, whose poses alternate; 30 frames per second."""
     lines = ["time_s," + ",".join(f"{body}_{part}" for body in ("object", "right") for part in PARTS)]
-    for frame in range(4):
+    for frame in range(len(rows) // 2):
         numbers = [
             [frame / 30],
             *(part for quaternion, position_m in rows[2 * frame : 2 * frame + 2] for part in (position_m, quaternion)),
         ]
         lines.append(",".join(map(str, np.concatenate(numbers))))
     return "\n".join(lines)
+
+
+def write_tracker_files(folder: Path) -> None:
+    """Write strapped.csv, mine.csv with a tracker instead of the wrist, and flat.csv, its calibration."""
+    wrist_from_tracker = RigidTransform(Rotation.from_rotvec([0.4, -1, 2]).as_matrix(), np.array([0.02, 0.05, -0.03]))
+    rows = object_and_wrist_poses(HAND.wrist_from_canonical.T)
+    poses = [RigidTransform(Rotation.from_quat(q[[1, 2, 3, 0]]).as_matrix(), position_m) for q, position_m in rows]
+    strapped = [pose @ wrist_from_tracker if number % 2 else pose for number, pose in enumerate(poses)]
+    sheet = RigidTransform(Rotation.from_rotvec([1.0, 0, 0.5]).as_matrix(), np.array([0.3, 0.2, 0.7]))
+    flat = [sheet, sheet @ sheet_from_wrist(HAND) @ wrist_from_tracker] * 40
+    for name, transforms in (("strapped", strapped), ("flat", flat)):
+        quaternions = [Rotation.from_matrix(pose.rotation).as_quat()[[3, 0, 1, 2]] for pose in transforms]
+        text = table([(quaternion, pose.translation) for quaternion, pose in zip(quaternions, transforms, strict=True)])
+        (folder / f"{name}.csv").write_text(text)
 
 
 def manipnet_text() -> str:
@@ -135,6 +159,50 @@ def test_a_csv_with_a_mesh_keeps_its_wrist_and_object(typed) -> None:
     np.testing.assert_allclose(arrays["wrist_m"][1] - arrays["object_translation_m"], [[0, 0.08, 0.07]] * 4, atol=1e-6)
     assert arrays["made"].tolist() == [[False] * 4, [True] * 4]
     assert "SYNTHETIC" not in page
+
+
+def test_a_strapped_on_tracker_with_its_calibration_gives_the_fingers_of_the_wrist(typed) -> None:
+    expected, _ = typed("mine.csv", "--object", "mug.obj")
+    with pytest.raises(BadInput, match="--calibration"):
+        typed("strapped.csv", "--object", "mug.obj")
+    arrays, page = typed("strapped.csv", "--object", "mug.obj", "--calibration", "flat.csv")
+    for name in ("wrist_m", "global_orient", "hand_pose"):
+        np.testing.assert_allclose(arrays[name], expected[name], atol=1e-5)
+    assert "the right tracker is 6.2 cm from the wrist joint" in page
+
+
+def test_a_tracker_over_udp_is_calibrated_too(tiny: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tiny)
+
+    def streamed(name: str, *words: str) -> list[str]:
+        names, *rows = [line.split(",") for line in Path(name).read_text().splitlines()]
+        datagrams = []
+        for row in rows:
+            columns = dict(zip(names, map(float, row), strict=True))
+            bodies = {body: [columns[f"{body}_{part}"] for part in PARTS] for body in ("object", "right")}
+            datagrams.append(json.dumps({"time_s": columns["time_s"], **bodies}).encode())
+        tracker = threading.Thread(target=send_when_open, args=(port := free_port(), [*datagrams, b'{"end": true}']))
+        tracker.start()
+        command = ("stream", "--from", f"udp://:{port}", "--object", "mug.obj", "--out", "live", "--fingers", "right")
+        done = CliRunner().invoke(app, [*command, *words], catch_exceptions=False)
+        tracker.join()
+        return done.stdout.splitlines()
+
+    expected, lines = streamed("mine.csv"), streamed("strapped.csv", "--calibration", "flat.csv")
+    assert len(lines) == len(expected) == 4
+    for line, one in zip(lines, expected, strict=True):
+        np.testing.assert_allclose(json.loads(line)["right"], json.loads(one)["right"], atol=1e-4)
+
+
+def test_a_scale_changes_the_mesh_and_not_the_trajectories(tiny: Path, typed) -> None:
+    trimesh.creation.box(np.array(BOX_M) * 1.2).export(tiny / "large.obj")
+    plain, _ = typed("mine.csv", "--object", "mug.obj")
+    scaled, _ = typed("mine.csv", "--object", "mug.obj", "--scale", "1.2")
+    large, _ = typed("mine.csv", "--object", "large.obj")
+    np.testing.assert_allclose(scaled["hand_pose"], large["hand_pose"], atol=1e-6)
+    assert np.abs(scaled["hand_pose"] - plain["hand_pose"]).max() > 1e-4
+    for name in ("wrist_m", "object_translation_m", "object_rotvec"):
+        np.testing.assert_array_equal(scaled[name], plain[name])
 
 
 def test_manipnets_text_file_and_mesh_are_mirrored(typed) -> None:
@@ -201,6 +269,10 @@ def test_motion_of_a_network_trained_on_synthetic_clips_is_marked(tiny: Path, ty
         (("demo1.txt.gz",), "gunzip"),
         ((TRAINED, "--object", "mug.obj"), "--object: expected no such option with a clip"),
         ((TRAINED, "--world-up", "z"), "--world-up: expected no such option with a clip"),
+        ((TRAINED, "--calibration", "flat.csv"), "--calibration: expected no such option with a clip"),
+        ((TRAINED, "--scale", "2"), "--scale: expected no such option with a clip"),
+        (("strapped.csv", "--object", "mug.obj", "--calibration", "flat.csv", "--wrist-axes", "canonical"), "omit it"),
+        (("demo1.txt", "--object", "cyl_med.obj", "--calibration", "flat.csv"), "the tracker on the left hand"),
         ((TRAINED, "--trajectory-unit", "cm"), "--trajectory-unit: expected no such option with a clip"),
         ((TRAINED, "--frames", "0:9", "--way", "interpolate"), "known poses on both sides"),
         (("toy/s1/9",), "closest: toy/s1/0"),
