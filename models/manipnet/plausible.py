@@ -10,12 +10,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import SIDES, Side
 from hoidata.errors import BadInput
 from hoidata.hands.tracked_hand import TrackedHand
+from hoidata.objects.convex_hull import convex_hull
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.objects.user_mesh import UNITS_M
@@ -192,33 +192,12 @@ def _inside(file: TrajectoryFile, placed_hands: Mapping[Side, _PlacedHand]) -> B
             got = f"a {side} palm inside it in {100 * fraction:.0f} % of the frames in which it is near"
             remedy = "perhaps the mesh has another unit (--unit cm), or another origin than in the trajectories"
             return BadInput(file.source, f"{name} outside of the hands", got, remedy)
-        buried = placed.distance_m(_hull(placed.control.model)) < MIN_WRIST_DISTANCE_M
+        buried = placed.distance_m(convex_hull(placed.control.model)) < MIN_WRIST_DISTANCE_M
         if (fraction := placed.fraction_of_near(buried)) > MAX_FRACTION:
             got = f"a {side} wrist in it or closer in {100 * fraction:.0f} % of the frames in which the palm is near"
             remedy = "check the unit of the positions (--trajectory-unit) and of the mesh (--unit)"
             return BadInput(file.source, f"a wrist at least {100 * MIN_WRIST_DISTANCE_M} cm off {name}", got, remedy)
     return None
-
-
-def _hull(model: ObjectModel) -> ObjectModel:
-    """Replace each part by its convex hull, which fills hollow objects; a flat part is unchanged."""
-    faces = [_hull_faces(model, part) for part in model.parts]
-    return replace(model, faces=np.concatenate(faces))
-
-
-def _hull_faces(model: ObjectModel, part: int) -> np.ndarray:
-    """(face, 3) vertex indices of a part's convex hull, oriented outward."""
-    part_faces = model.faces_of(part)
-    vertex_ids = np.unique(part_faces)
-    try:
-        hull = ConvexHull(model.vertices_m[vertex_ids])
-    except QhullError:
-        return part_faces
-    corners = model.vertices_m[vertex_ids][hull.simplices]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inward = (normal * hull.equations[:, :3]).sum(axis=1) < 0
-    simplices = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices)
-    return vertex_ids[simplices].astype(part_faces.dtype)
 
 
 def _reordered(body: Motion) -> Motion:

@@ -128,7 +128,7 @@ def from_arrays(arrays: Mapping[str, np.ndarray], source: str, unit: str = "m") 
     time_s = _array(arrays, "time_s", (), source)
     _check_times(time_s, source)
     sides: list[Side] = [side for side in SIDES if f"{side}_position" in arrays]
-    bodies = {side: _body(arrays, side, time_s, source, UNITS_M[unit]) for side in sides}
+    bodies: dict[Side, Motion] = {side: _body(arrays, side, time_s, source, UNITS_M[unit]) for side in sides}
     wrists: dict[Side, Motion] = {side: body for side, body in bodies.items() if len(body.time_s)}
     if not wrists:
         raise BadInput(source, "the wrist of a hand, left or right", "neither", "add left_... or right_...")

@@ -17,9 +17,9 @@ from hoidata.errors import BadInput
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
+from hoidata.hands.tracker_offset import sheet_from_wrist
 from hoidata.sensors.mano_hand import mano_hand
 from models.common.training import train_network
-from models.manipnet.calibration import sheet_from_wrist
 from models.manipnet.training import MANIPNET
 from models.manipnet.trajectory_files import PARTS
 from pipelines.cli import app
