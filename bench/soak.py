@@ -23,13 +23,14 @@ import trimesh
 
 from bench.harness import show
 from hoidata.clips.clip import SIDES, Side
+from hoidata.geometry.motion import Motion
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
 from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import load_checkpoint
-from models.manipnet.control import Control, Motion, control_from_clip, hands_of
+from models.manipnet.control import Control, control_from_clip, hands_of
 from models.manipnet.network import ManipNet
 from models.manipnet.rollout import Predictor
 from models.manipnet.stream import Stream, TrackedFrame, tracked_frames

@@ -29,6 +29,7 @@ from models.manipnet.animate import (
     at_30_fps,
     clip_of,
     control_from_file,
+    control_of_two_objects,
     gap_of,
     interpolate_fingers,
     predict_fingers,
@@ -59,7 +60,11 @@ from pipelines.show_pages import dataset_of_clip
 from pipelines.stages.base import StagePaths, load_hands
 
 Method = Literal["auto", "network", "interpolate"]
-ARRAYS = SHARED | {"made": "(S, F) whether the fingers were generated"}
+ARRAYS = SHARED | {
+    "made": "(S, F) whether the fingers were generated",
+    "left_object_rotvec": "(F, 3) as object_rotvec, of another object in the left hand",
+    "left_object_translation_m": "(F, 3) as object_translation_m",
+}
 UPS = {"": None, "x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -72,6 +77,7 @@ class AnimationOptions:
     model: str = ""  # the dataset whose network to use; "" for the clip's dataset, else the first that has one
     rule: Rule = "preset"
     object: str = ""  # of a file of trajectories: a mesh file, or the name of an object of the dataset
+    left_object: str = ""  # the same, if the left hand has another object
     unit: str = ""  # of positions in a file of trajectories
     axes: Axes = "model"  # of the wrists in a file of trajectories
     up: str = ""  # of a file of trajectories: the world axis that points up
@@ -83,6 +89,7 @@ class AnimationOptions:
         """Raise BadInput for an option that applies only to a file of trajectories."""
         file_options = {
             "--object": self.object,
+            "--left-object": self.left_object,
             "--trajectory-unit": self.unit,
             "--wrist-axes": "" if self.axes == "model" else self.axes,
             "--world-up": self.up,
@@ -203,12 +210,18 @@ def stream_files(
 
 def _written(animation: Animation, out: Path, store: Path | None) -> WrittenFiles:
     clip, hands, ghosts, generated = animation.clip, animation.hands, animation.ghosts, animation.generated
-    checks = verdict(clip, hands, sides=[side for side, frames in zip(SIDES, generated, strict=True) if frames.any()])
+    info = animation.source_info
+    left_objects = () if info else clip.other_objects  # those of a recorded clip are others
+    sides: list[Side] = [side for side, frames in zip(SIDES, generated, strict=True) if frames.any()]
+    checks = verdict(clip, hands, sides=[side for side in sides if side == "right" or not left_objects])
+    arrays = motion_arrays(clip, hands) | {"made": generated}
+    for left in left_objects:
+        arrays |= {"left_object_rotvec": left.rotvec, "left_object_translation_m": left.translation_m}
     length = ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s")
     paths = write_motions(
         out,
         "animation.html",
-        [MotionFiles(clip, motion_arrays(clip, hands) | {"made": generated}, ghosts=ghosts)],
+        [MotionFiles(clip, arrays, ghosts=ghosts)],
         hands,
         ARRAYS,
         title=clip.clip_id,
@@ -218,7 +231,6 @@ def _written(animation: Animation, out: Path, store: Path | None) -> WrittenFile
         facts=[*animation.facts, length, ("hand model", hands.name)],
         verdicts=[("", summary(checks), checks)],
     )
-    info = animation.source_info
     stored = replace(clip, clip_id=f"{clip.clip_id}~0") if info else clip
     paths += write_motion_store(store, [stored], hands, animation.network_facts, **info)
     return WrittenFiles(paths, animation.notes, verdict_lines(0, checks))
@@ -321,20 +333,21 @@ def _stream_fingers(
     in_real_time: bool,
 ) -> dict[Side, np.ndarray]:
     frames = tracked_frames(tracked)
-    _, poses = _played(predictor, hands, control.model, _at_recorded_speed(frames) if in_real_time else frames, show)
+    models: dict[Side, ObjectModel] = {side: control.of(side).model for side in SIDES}
+    _, poses = _played(predictor, hands, models, _at_recorded_speed(frames) if in_real_time else frames, show)
     return _poses_of_frames(poses, predictor, hands, len(control.object_motion.time_s))
 
 
 def _played(
     predictor: Predictor,
     hands: Mapping[Side, TrackedHand],
-    model: ObjectModel,
+    models: dict[Side, ObjectModel],
     frames: Iterable[TrackedFrame],
     show: ShowPoses,
 ) -> tuple[list[TrackedFrame], list[dict[Side, np.ndarray]]]:
     """Push frames through a stream; return those that are not late, with times of its clock, and all poses."""
     start: dict[Side, np.ndarray] = {side: hand.rest_rotmats for side, hand in hands.items()}
-    stream = Stream(predictor, hands, dict.fromkeys(hands, model), start)
+    stream = Stream(predictor, hands, models, start)
     accepted, shown = list[TrackedFrame](), list[dict[Side, np.ndarray]]()
 
     def show_all(poses: list[dict[Side, np.ndarray]]) -> None:
@@ -376,19 +389,22 @@ def _from_tracker(
     """Animate a tracker's frames until they end; a hand is invalid while its wrist is lost."""
     address = parse_address(source)
     network = chosen_network(options, project)
-    model, notes = _object(options, options.mesh.unit, project)
+    models, notes = _objects(options, options.mesh.unit, project)
     mean_hands, predictor = hands_of(project.hands, np.zeros((2, 10), np.float32), None), network.predictor
     hands: dict[Side, TrackedHand] = {side: mean_hands[side] for side in options.sides}
-    tracker = Tracker(address, model.is_articulated, report)
+    tracker = Tracker(address, models["right"].is_articulated, report, bool(options.left_object))
     tracked = tracker.frames()
     if options.calibration:
         recording = read_trajectories(Path(options.calibration))
         offsets, offset_notes = offsets_of(recording, mean_hands, options.sides)
         notes += offset_notes
         tracked = (calibrated_frame(frame, offsets) for frame in tracked)
-    frames, poses = _played(predictor, hands, model, tracked, show)
+    frames, poses = _played(predictor, hands, models, tracked, show)
     notes.append(f"{tracker.refused} of {tracker.received} datagrams were refused")
-    control, valid = control_of_frames(frames, model)
+    control, valid = control_of_frames(frames, models["right"])
+    if control and options.left_object:
+        left, _ = control_of_frames(frames, models["left"], "left")
+        control = left and replace(control, left=left)
     if control is None or not valid[[side in hands for side in SIDES]].any():
         got = f"none in {len(frames)} frames"
         raise BadInput(source, "poses of the object and of a wrist", got, "send them (docs/fingers.md)")
@@ -396,7 +412,7 @@ def _from_tracker(
     clip = clip_of(control, fingers, UPS[options.up], "live", network.is_synthetic)
     generated = valid & np.array([[side in hands] for side in SIDES])
     tracks = {side: replace(clip.hands[side], valid=tracked) for side, tracked in zip(SIDES, generated, strict=True)}
-    rows = [*network.rows, ("object", model.name), ("source", source)]
+    rows = [*network.rows, _objects_row(models), ("source", source)]
     return Animation(replace(clip, hands=tracks), generated, {}, project.hands, rows, notes, network.facts)
 
 
@@ -406,14 +422,20 @@ def _from_file(
     options.check_for_file()
     trajectories = read_trajectories(path, options.unit, options.axes)
     network = chosen_network(options, project)
-    model, notes = _object(options, options.mesh.unit or trajectories.mesh_unit, project)
+    models, notes = _objects(options, options.mesh.unit or trajectories.mesh_unit, project)
+    if bool(options.left_object) != (trajectories.left_object is not None):
+        got = "only one of them"
+        raise BadInput("--left-object", "a mesh and left_object columns, or neither", got, "add the other, or omit it")
     mean_hands = hands_of(project.hands, np.zeros((2, 10), np.float32), None)
     if options.calibration:
         recording = read_trajectories(Path(options.calibration), options.unit)
         offsets, offset_notes = offsets_of(recording, mean_hands, set(options.sides) & set(trajectories.wrists))
         notes += offset_notes
         trajectories = calibrated_file(trajectories, offsets)
-    given = control_from_file(trajectories, model, mean_hands)
+    if options.left_object:
+        given = control_of_two_objects(trajectories, models, mean_hands)
+    else:
+        given = control_from_file(trajectories, models["right"], mean_hands)
     notes += [*given.notes, *_skipped_hand_notes(trajectories, given, options.sides)]
     control = at_30_fps(given.control)
     n_frames = len(control.object_motion.time_s)
@@ -425,7 +447,7 @@ def _from_file(
     fingers |= predict(network.predictor, animated, given.control, control)
     generated[[SIDES.index(side) for side in animated]] = True
     clip = clip_of(control, fingers, trajectories.up or UPS[options.up], path.stem, network.is_synthetic)
-    return Animation(clip, generated, {}, project.hands, [*network.rows, ("object", model.name)], notes, network.facts)
+    return Animation(clip, generated, {}, project.hands, [*network.rows, _objects_row(models)], notes, network.facts)
 
 
 def _skipped_hand_notes(trajectories: TrajectoryFile, given: AnimationInput, sides: tuple[Side, ...]) -> list[str]:
@@ -436,6 +458,22 @@ def _skipped_hand_notes(trajectories: TrajectoryFile, given: AnimationInput, sid
         raise BadInput("--fingers", "a hand that is in the file and near the object", sides[0], remedy)
     skipped = [side for side in given.active if side not in sides]
     return [f"the {side} hand was not requested (--fingers) and keeps its neutral pose" for side in skipped]
+
+
+def _objects(options: AnimationOptions, unit: str, project: ProjectData) -> tuple[dict[Side, ObjectModel], list[str]]:
+    """The object of each hand, by default one for both; and notes for the user."""
+    model, notes = _object(options, unit, project)
+    if not options.left_object:
+        return dict.fromkeys(SIDES, model), notes
+    mesh = replace(options.mesh, hinge="", moving="")
+    left, left_notes = _object(replace(options, object=options.left_object, mesh=mesh), unit, project)
+    if left.is_articulated:
+        raise BadInput("--left-object", "a rigid object", "one with a joint", "swap the hands, or join its parts")
+    return {"left": left, "right": model}, notes + left_notes
+
+
+def _objects_row(models: Mapping[Side, ObjectModel]) -> tuple[str, str]:
+    return "object", ", ".join(dict.fromkeys(models[side].name for side in ("right", "left")))
 
 
 def _object(options: AnimationOptions, unit: str, project: ProjectData) -> tuple[ObjectModel, list[str]]:

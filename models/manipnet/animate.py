@@ -8,12 +8,13 @@ import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.errors import BadInput
+from hoidata.geometry.motion import Motion, interpolate_rotations
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands.kinematics import track_rotmats
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
-from models.manipnet.control import Control, Motion, interpolate_rotations
+from models.manipnet.control import Control
 from models.manipnet.plausible import plausible_reading
 from models.manipnet.rollout import Predictor, RolloutTask, roll_out
 from models.manipnet.trajectory_files import MAX_FRAMES, TrajectoryFile
@@ -49,6 +50,20 @@ def control_from_file(file: TrajectoryFile, model: ObjectModel, hands: Mapping[S
     if note := surface_index(model).repair_note:
         notes.append(f"{note}; fingers may pass through open parts")
     return AnimationInput(accepted.control, accepted.active, notes)
+
+
+def control_of_two_objects(
+    file: TrajectoryFile, models: Mapping[Side, ObjectModel], hands: Mapping[Side, TrackedHand]
+) -> AnimationInput:
+    """Likewise with an object in each hand."""
+    if len(file.wrists) < len(SIDES):
+        raise BadInput(file.source, "both wrists, with an object in each hand", "one", "add the other one")
+    given = {side: control_from_file(file.of(side), models[side], hands) for side in SIDES}
+    wrists: dict[Side, Motion] = {side: given[side].control.wrists[side] for side in SIDES}
+    left, right = (replace(given[side].control, wrists=wrists) for side in SIDES)
+    return AnimationInput(
+        replace(right, left=left), list(SIDES), [note for side in SIDES for note in given[side].notes]
+    )
 
 
 def at_30_fps(control: Control) -> Control:
@@ -93,7 +108,7 @@ def predict_fingers(predictor: Predictor, hand: TrackedHand, side: Side, control
     known_frames = int(gap.before is not None)
     start = hand.rest_rotmats if gap.before is None else gap.before
     time_s = control.object_motion.time_s[gap.first - known_frames : gap.stop]
-    (predicted,) = roll_out(predictor, [RolloutTask(hand, side, control, time_s, start)])
+    (predicted,) = roll_out(predictor, [RolloutTask(hand, side, control.of(side), time_s, start)])
     return blend_ends(predicted[known_frames:], gap.before, gap.after, round(SEAM_S * FPS))
 
 
@@ -154,16 +169,14 @@ def clip_of(control: Control, fingers: Mapping[Side, np.ndarray], up: tuple[floa
         )
         betas = np.zeros((1, 10), np.float32)
         tracks[side] = HandTrack(wrist_m, orient, hand_pose, betas=betas, valid=np.full(n_frames, has_fingers))
-    rotvec, hinge_rad = rotmat_to_rotvec(control.object_motion.rotmats).astype(np.float32), control.hinge_rad
-    position_m = control.object_motion.position_m.astype(np.float32)
-    hinge_rad = None if hinge_rad is None else hinge_rad.astype(np.float32)
     return Clip(
         clip_id=f"animated/{name}",
         dataset="generated",
         subject="generated",
         sequence=name,
         hands=tracks,
-        object=ObjectTrack(control.model, rotvec, position_m, hinge_rad),
+        object=_object_track(control),
+        other_objects=(_object_track(control.left),) if control.left else (),
         source_frames=np.arange(n_frames, dtype=np.int32),
         gravity=None if up is None else -np.asarray(up),
         gravity_note="" if up else "the file of trajectories does not state which axis is up",
@@ -171,3 +184,9 @@ def clip_of(control: Control, fingers: Mapping[Side, np.ndarray], up: tuple[floa
         object_words=control.model.name.replace("_", " "),
         synthetic=synthetic,
     )
+
+
+def _object_track(control: Control) -> ObjectTrack:
+    rotvec, hinge_rad = rotmat_to_rotvec(control.object_motion.rotmats).astype(np.float32), control.hinge_rad
+    position_m = control.object_motion.position_m.astype(np.float32)
+    return ObjectTrack(control.model, rotvec, position_m, None if hinge_rad is None else hinge_rad.astype(np.float32))

@@ -7,10 +7,10 @@ import numpy as np
 
 from hoidata.clips.clip import Side
 from hoidata.errors import BadInput
+from hoidata.geometry.motion import Motion
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.hands.tracker_offset import tracker_from_wrist
-from models.manipnet.control import Motion
 from models.manipnet.stream import TrackedFrame
 from models.manipnet.trajectory_files import TrajectoryFile
 

@@ -16,20 +16,13 @@ from hoidata.batches.dataset import ClipBatch, ClipSample
 from hoidata.clips.clip import FPS, SIDES, Side
 from hoidata.devices import send
 from hoidata.errors import BadInput
+from hoidata.geometry.motion import interpolate_rotations, poses_at
 from hoidata.hands import HandPair
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors import sensor_size
 from models.common.family import Losses, Network, Setup
-from models.manipnet.control import (
-    Control,
-    control_of,
-    finger_rotmats_of,
-    hands_of,
-    interpolate_rotations,
-    poses_at,
-    trajectories_of,
-)
+from models.manipnet.control import Control, control_of, finger_rotmats_of, hands_of, trajectories_of
 from models.manipnet.features import FeatureSettings, hand_inputs, mirrored_to_right, outputs, sizes, std_floors
 from models.manipnet.inverse_kinematics import rotvecs_from_rest
 from models.manipnet.network import ManipNet, NetworkConfig

@@ -2,6 +2,7 @@
 
 CSV: a header, then one line per frame, columns in any order: ``time_s``, and for each of ``object``, ``left`` and
 ``right`` (one hand may be missing) the seven ``<body>_x _y _z _qw _qx _qy _qz``; ``hinge_rad`` for a hinged object.
+With an object in each hand, ``left_object`` is the left hand's, and ``object`` the right hand's.
 NPZ: ``time_s (frame,)``, ``<body>_position (frame, 3)``, ``<body>_quaternion (frame, 4)`` with w first, ``hinge_rad``.
 A body is lost in frames with an empty cell or NaN; gaps of up to ``MAX_STEP_S`` are interpolated.
 Positions are in metres or the given unit, in a right-handed world. The object's pose is that of its mesh file's frame.
@@ -26,11 +27,11 @@ from scipy.spatial.transform import Rotation
 from hoidata.clips.clip import SIDES, Side
 from hoidata.errors import BadInput
 from hoidata.files.numpy_files import load_npz_arrays
+from hoidata.geometry.motion import Motion
 from hoidata.objects.user_mesh import UNITS_M
-from models.manipnet.control import Motion
 
 Axes = Literal["model", "canonical"]
-BODIES = ("object", *SIDES)
+BODIES = ("object", *SIDES, "left_object")
 PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 ENDINGS = (".csv", ".npz", ".txt")
 MAX_RATE_HZ, MIN_RATE_HZ = 1000.0, 5.0
@@ -49,6 +50,7 @@ class TrajectoryFile:
     wrists: Mapping[Side, Motion]  # one or both
     object_body: Motion
     hinge_rad: np.ndarray | None = None  # (frame,)
+    left_object: Motion | None = None  # if the left hand has another object than ``object_body``
     axes: Axes = "model"  # of the wrists
     is_calibrated: bool = False  # whether a calibration has changed the wrists
     at_box: bool = False  # whether the object's position is the centre of its bounding box
@@ -59,6 +61,13 @@ class TrajectoryFile:
     def with_bodies(self, change: Callable[[Motion], Motion]) -> "TrajectoryFile":
         wrists: dict[Side, Motion] = {side: change(body) for side, body in self.wrists.items()}
         return replace(self, wrists=wrists, object_body=change(self.object_body))
+
+    def of(self, side: Side) -> "TrajectoryFile":
+        """One hand of a file with two objects, with its object."""
+        wrists: dict[Side, Motion] = {side: self.wrists[side]}
+        if side == "right" or self.left_object is None:
+            return replace(self, wrists=wrists, left_object=None)
+        return replace(self, wrists=wrists, object_body=self.left_object, hinge_rad=None, left_object=None)
 
 
 def read_trajectories(path: Path, unit: str = "", axes: Axes = "model") -> TrajectoryFile:
@@ -136,12 +145,15 @@ def from_arrays(arrays: Mapping[str, np.ndarray], source: str, unit: str = "m") 
     if "hinge_rad" in arrays:
         angles = _array(arrays, "hinge_rad", (), source, len(time_s), may_be_lost=True)
         hinge = _array({"hinge_rad": angles[np.isin(time_s, object_body.time_s)]}, "hinge_rad", (), source)
-    for name, body in {**wrists, "object": object_body}.items():
+    objects = {"object": object_body}
+    if "left_object_position" in arrays:
+        objects["left_object"] = _body(arrays, "left_object", time_s, source, UNITS_M[unit])
+    for name, body in {**wrists, **objects}.items():
         gap_s = np.diff(np.r_[time_s[0], body.time_s, time_s[-1]]).max()
         if gap_s > MAX_STEP_S or not len(body.time_s):
             expected, got = f"gaps of at most {MAX_STEP_S:g} s", f"{name} lost for {gap_s:.2f} s"
             raise BadInput(source, expected, got, "cut the file there")
-    return TrajectoryFile(source=source, wrists=wrists, object_body=object_body, hinge_rad=hinge, unit=unit)
+    return TrajectoryFile(source, wrists, object_body, hinge, objects.get("left_object"), unit=unit)
 
 
 def parse_manipnet(data: bytes, source: str) -> TrajectoryFile:
@@ -154,7 +166,7 @@ def parse_manipnet(data: bytes, source: str) -> TrajectoryFile:
         raise BadInput(source, "a frame rate in the first line", f"{lines[0][:40] if lines else 'nothing'}", remedy)
     table = _numbers([line.split(",") for line in lines[1:]], 21, source)
     arrays = {"time_s": np.arange(len(table)) / rate}
-    for number, body in enumerate(BODIES):
+    for number, body in enumerate(BODIES[:3]):
         columns = table[:, 7 * number : 7 * number + 7]
         arrays[f"{body}_quaternion"] = columns[:, [3, 0, 1, 2]] * _MIRROR_QUATERNION
         arrays[f"{body}_position"] = columns[:, 4:] * _MIRROR_POSITION

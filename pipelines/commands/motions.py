@@ -31,6 +31,7 @@ MeshHinge = Annotated[
     typer.Option(help="Hinge of a mesh of two pieces, 'px,py,pz dx,dy,dz': point and direction; a slide: direction."),
 ]
 Moving = Annotated[str, typer.Option(help="What moves: joint of a URDF, or pieces of a mesh with --hinge.")]
+LeftObject = Annotated[str, typer.Option(help="Another rigid object in the left hand (docs/fingers.md).")]
 Calibration = Annotated[
     str, typer.Option(help="A recording of flat hands that calibrates trackers to the wrists (docs/fingers.md).")
 ]
@@ -221,6 +222,7 @@ def animate(
             help="Wrist axes in .csv and .npz files: the hand model's, or canonical (x to the fingers, y to the thumb)."
         ),
     ] = "model",
+    left_object: LeftObject = "",
     calibration: Calibration = "",
     world_up: WorldUp = "",
     unit: MeshUnit = "",
@@ -236,7 +238,7 @@ def animate(
     profile: Profile = "",
 ) -> None:
     """Generate finger motion for given wrist and object trajectories; write arrays, an animated GLB and a web page."""
-    source, object, calibration = map(_absolute, (source, object, calibration))
+    source, object, left_object, calibration = map(_absolute, (source, object, left_object, calibration))
     project = _project(profile)
     from hoidata.clips.clip import SIDES
     from pipelines.animation import AnimationOptions, animate_files
@@ -248,6 +250,7 @@ def animate(
         model=model,
         rule=rule,
         object=object,
+        left_object=left_object,
         unit=trajectory_unit,
         axes=wrist_axes,
         up=world_up,
@@ -270,6 +273,7 @@ def stream(
     fast: Annotated[bool, typer.Option("--fast", help="Do not wait for the times of a file.")] = False,
     fingers: Fingers = "both",
     model: Annotated[str, typer.Option(help="Dataset whose network to use. Default: the first with a network.")] = "",
+    left_object: LeftObject = "",
     calibration: Calibration = "",
     world_up: WorldUp = "",
     unit: MeshUnit = "",
@@ -281,7 +285,7 @@ def stream(
 
     Prints a pose per line: time_s, axis-angles (15, 3) of each hand. Then writes what `animate` does.
     """
-    object, calibration = map(_absolute, (object, calibration))
+    object, left_object, calibration = map(_absolute, (object, left_object, calibration))
     source = source if "://" in source else str(Path(source).absolute())
     project = _project("")
     from hoidata.clips.clip import SIDES
@@ -292,6 +296,7 @@ def stream(
         sides=SIDES if fingers == "both" else (fingers,),
         model=model,
         object=object,
+        left_object=left_object,
         up=world_up,
         calibration=calibration,
         mesh=MeshOptions(unit, "", hinge, moving, scale),

@@ -2,6 +2,7 @@
 
 import json
 import threading
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +13,14 @@ import yaml
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from hoidata.clips.clip import Clip
+from hoidata.clips.clip import SIDES, Clip
 from hoidata.errors import BadInput
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.hands.tracker_offset import sheet_from_wrist
 from hoidata.sensors.mano_hand import mano_hand
+from hoidata.store.store import open_store
 from models.common.training import train_network
 from models.manipnet.training import MANIPNET
 from models.manipnet.trajectory_files import PARTS
@@ -27,7 +29,7 @@ from tests.builders.clips import build_clip
 from tests.builders.stores import write_annotated
 from tests.builders.udp import free_port, send_when_open
 
-HAND = mano_hand(load_embedded_hands(), "right")
+LEFT_HAND, HAND = (mano_hand(load_embedded_hands(), side) for side in SIDES)
 pytestmark = pytest.mark.slow  # a network is trained, and sensors are compiled
 TINY = {
     "network": {"encoder": 8},
@@ -79,6 +81,7 @@ def write_user_files(folder: Path) -> None:
     (folder / "mine.csv").write_text(csv_text(HAND))
     (folder / "demo1.txt").write_text(manipnet_text())
     write_tracker_files(folder)
+    write_tea_files(folder)
 
 
 def object_and_wrist_poses(wrist_axes: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -96,16 +99,33 @@ def csv_text(hand: TrackedHand) -> str:
     return table(object_and_wrist_poses(hand.wrist_from_canonical.T))
 
 
-def table(rows: list[tuple[np.ndarray, np.ndarray]]) -> str:
-    """A table of object and right wrist, whose poses alternate; 30 frames per second."""
-    lines = ["time_s," + ",".join(f"{body}_{part}" for body in ("object", "right") for part in PARTS)]
-    for frame in range(len(rows) // 2):
-        numbers = [
-            [frame / 30],
-            *(part for quaternion, position_m in rows[2 * frame : 2 * frame + 2] for part in (position_m, quaternion)),
-        ]
-        lines.append(",".join(map(str, np.concatenate(numbers))))
+def table(rows: list[tuple[np.ndarray, np.ndarray]], bodies: Sequence[str] = ("object", "right")) -> str:
+    """A table of bodies, whose poses alternate; 30 frames per second."""
+    lines = ["time_s," + ",".join(f"{body}_{part}" for body in bodies for part in PARTS)]
+    for first in range(0, len(rows), len(bodies)):
+        poses = rows[first : first + len(bodies)]
+        numbers = [part for quaternion, position_m in poses for part in (*position_m, *quaternion)]
+        lines.append(",".join(map(str, [first / len(bodies) / 30, *numbers])))
     return "\n".join(lines)
+
+
+def write_tea_files(folder: Path) -> None:
+    """Write pot.obj and tea.csv: the box in the right hand, a pot in the left; and one file for each hand."""
+    trimesh.creation.cylinder(0.03, 0.1).export(folder / "pot.obj")
+    rows = object_and_wrist_poses(HAND.wrist_from_canonical.T)
+    left_rotmat = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, 1]]) @ LEFT_HAND.wrist_from_canonical.T
+    left_quaternion = Rotation.from_matrix(left_rotmat).as_quat()[[3, 0, 1, 2]]
+    both, left = [], []
+    for (quaternion, object_m), right in zip(rows[::2], rows[1::2], strict=True):
+        pot_m = object_m + np.array([-0.5, 0, 0.1 * object_m[0]])
+        pot, wrist = (quaternion, pot_m), (left_quaternion, pot_m + np.array([0, 0.08, 0.07]))
+        both += [(quaternion, object_m), right, pot, wrist]
+        left += [pot, wrist, right]
+    (folder / "tea.csv").write_text(table(both, ("object", "right", "left_object", "left")))
+    (folder / "right.csv").write_text(
+        table([row for i, row in enumerate(both) if i % 4 != 2], ("object", "right", "left"))
+    )
+    (folder / "left.csv").write_text(table(left, ("object", "left", "right")))
 
 
 def write_tracker_files(folder: Path) -> None:
@@ -171,27 +191,57 @@ def test_a_strapped_on_tracker_with_its_calibration_gives_the_fingers_of_the_wri
     assert "the right tracker is 6.2 cm from the wrist joint" in page
 
 
+def streamed(source: str, *words: str) -> list[dict]:
+    """The poses of ``hoidata stream`` for the rows of a table as datagrams."""
+    names, *rows = [line.split(",") for line in Path(source).read_text().splitlines()]
+    bodies = dict.fromkeys(name.rsplit("_", 1)[0] for name in names[1:])
+    datagrams = []
+    for row in rows:
+        columns = dict(zip(names, map(float, row), strict=True))
+        poses = {body: [columns[f"{body}_{part}"] for part in PARTS] for body in bodies}
+        datagrams.append(json.dumps({"time_s": columns["time_s"], **poses}).encode())
+    tracker = threading.Thread(target=send_when_open, args=(port := free_port(), [*datagrams, b'{"end": true}']))
+    tracker.start()
+    command = ("stream", "--from", f"udp://:{port}", "--out", "live")
+    done = CliRunner().invoke(app, [*command, *words], catch_exceptions=False)
+    tracker.join()
+    assert done.exit_code == 0, done.output
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
 def test_a_tracker_over_udp_is_calibrated_too(tiny: Path, monkeypatch) -> None:
     monkeypatch.chdir(tiny)
+    words = ("--object", "mug.obj", "--fingers", "right")
+    expected, poses = streamed("mine.csv", *words), streamed("strapped.csv", *words, "--calibration", "flat.csv")
+    assert len(poses) == len(expected) == 4
+    np.testing.assert_allclose(*([pose["right"] for pose in given] for given in (poses, expected)), atol=1e-4)
 
-    def streamed(name: str, *words: str) -> list[str]:
-        names, *rows = [line.split(",") for line in Path(name).read_text().splitlines()]
-        datagrams = []
-        for row in rows:
-            columns = dict(zip(names, map(float, row), strict=True))
-            bodies = {body: [columns[f"{body}_{part}"] for part in PARTS] for body in ("object", "right")}
-            datagrams.append(json.dumps({"time_s": columns["time_s"], **bodies}).encode())
-        tracker = threading.Thread(target=send_when_open, args=(port := free_port(), [*datagrams, b'{"end": true}']))
-        tracker.start()
-        command = ("stream", "--from", f"udp://:{port}", "--object", "mug.obj", "--out", "live", "--fingers", "right")
-        done = CliRunner().invoke(app, [*command, *words], catch_exceptions=False)
-        tracker.join()
-        return done.stdout.splitlines()
 
-    expected, lines = streamed("mine.csv"), streamed("strapped.csv", "--calibration", "flat.csv")
-    assert len(lines) == len(expected) == 4
-    for line, one in zip(lines, expected, strict=True):
-        np.testing.assert_allclose(json.loads(line)["right"], json.loads(one)["right"], atol=1e-4)
+def test_each_hand_holds_its_own_object_and_the_files_have_both(tiny: Path, typed, monkeypatch) -> None:
+    words = ("--object", "mug.obj", "--left-object", "pot.obj")
+    both, page = typed("tea.csv", *words)
+    right, _ = typed("right.csv", "--object", "mug.obj", "--fingers", "right")
+    left, _ = typed("left.csv", "--object", "pot.obj", "--fingers", "left")
+    np.testing.assert_allclose(both["hand_pose"][1], right["hand_pose"][1], atol=1e-5)
+    np.testing.assert_allclose(both["hand_pose"][0], left["hand_pose"][0], atol=1e-5)
+    np.testing.assert_array_equal(both["left_object_translation_m"], left["object_translation_m"])
+    np.testing.assert_array_equal(both["object_translation_m"], right["object_translation_m"])
+    assert both["made"].all()
+    assert "mug, pot" in page
+    store = tiny / "tea-store"
+    poses = streamed("tea.csv", *words, "--store", str(store))
+    command = ("stream", "--from", "tea.csv", "--fast", "--out", "live", *words)
+    lines = CliRunner().invoke(app, command, catch_exceptions=False).stdout.splitlines()
+    assert [json.loads(line) for line in lines] == poses
+    for index, side in enumerate(SIDES):
+        np.testing.assert_allclose(
+            np.reshape([pose[side] for pose in poses], (4, 45)), both["hand_pose"][index], atol=1e-4
+        )
+    clip = open_store(store).clip("animated/live")
+    assert (clip.object.model.name, [track.model.name for track in clip.other_objects]) == ("mug", ["pot"])
+    np.testing.assert_allclose(clip.other_objects[0].translation_m, both["left_object_translation_m"], atol=1e-6)
+    glb = trimesh.load(tiny / "live" / "motion.glb")
+    assert "other object 0" in glb.graph.nodes
 
 
 def test_a_scale_changes_the_mesh_and_not_the_trajectories(tiny: Path, typed) -> None:
@@ -270,6 +320,9 @@ def test_motion_of_a_network_trained_on_synthetic_clips_is_marked(tiny: Path, ty
         ((TRAINED, "--object", "mug.obj"), "--object: expected no such option with a clip"),
         ((TRAINED, "--world-up", "z"), "--world-up: expected no such option with a clip"),
         ((TRAINED, "--calibration", "flat.csv"), "--calibration: expected no such option with a clip"),
+        ((TRAINED, "--left-object", "pot.obj"), "--left-object: expected no such option with a clip"),
+        (("tea.csv", "--object", "mug.obj"), "a mesh and left_object columns, or neither"),
+        (("right.csv", "--object", "mug.obj", "--left-object", "pot.obj"), "a mesh and left_object columns"),
         ((TRAINED, "--scale", "2"), "--scale: expected no such option with a clip"),
         (("strapped.csv", "--object", "mug.obj", "--calibration", "flat.csv", "--wrist-axes", "canonical"), "omit it"),
         (("demo1.txt", "--object", "cyl_med.obj", "--calibration", "flat.csv"), "the tracker on the left hand"),

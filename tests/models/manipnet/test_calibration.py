@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import SIDES, Side
 from hoidata.errors import BadInput
+from hoidata.geometry.motion import Motion
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracker_offset import WRIST_M, sheet_from_wrist
 from hoidata.sensors.mano_hand import mano_hand
 from models.manipnet.calibration import calibrated_file, calibrated_frame, offsets_of
-from models.manipnet.control import Motion
 from models.manipnet.datagrams import parse_frame
 from models.manipnet.trajectory_files import PARTS, TrajectoryFile, parse_csv
 

@@ -13,6 +13,7 @@ from hoidata.batches.dataset import ClipSample
 from hoidata.clips.clip import FPS, SIDES, Clip, Side
 from hoidata.datasets import RawTree
 from hoidata.datasets.manipnet.adapter import read_hand_recording
+from hoidata.geometry.motion import Motion
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands
@@ -26,7 +27,7 @@ from hoidata.store.annotated import AnnotatedStore
 from models.common.family import Sources
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.training import TrainingSpec, train_network
-from models.manipnet.control import Control, Motion, hands_of
+from models.manipnet.control import Control, hands_of
 from models.manipnet.family import FingerSampler
 from models.manipnet.features import FeatureSettings, hand_inputs, outputs, pose_features, trajectory_features
 from models.manipnet.network import ManipNet, NetworkConfig

@@ -10,11 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import SIDES
 from hoidata.errors import BadInput
+from hoidata.geometry.motion import Motion
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.user_mesh import UNITS_M
 from hoidata.sensors.mano_hand import mano_hand
 from models.manipnet.animate import at_30_fps, blend_ends, control_from_file, interpolated
-from models.manipnet.control import Control, Motion
+from models.manipnet.control import Control
 from models.manipnet.plausible import reading
 from models.manipnet.trajectory_files import PARTS, Axes, parse_csv, parse_manipnet, read_trajectories
 from tests.builders.objects import box_model, model_of, notebook
