@@ -20,13 +20,14 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.metrics.verdict import summary, verdict, verdict_lines
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import is_object_path, read_user_object
+from hoidata.sensors.mano_hand import mano_hands
 from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import load_checkpoint
 from models.common.repeatable import make_repeatable
 from models.manipnet.animate import (
     AnimationInput,
     Gap,
-    at_30_fps,
+    at_rate,
     clip_of,
     control_from_file,
     control_of_two_objects,
@@ -36,7 +37,7 @@ from models.manipnet.animate import (
     with_fingers,
 )
 from models.manipnet.calibration import calibrated_file, calibrated_frame, offsets_of
-from models.manipnet.control import Control, control_from_clip, hands_of
+from models.manipnet.control import Control, control_from_clip
 from models.manipnet.datagrams import Tracker, parse_address, pose_line
 from models.manipnet.network import ManipNet
 from models.manipnet.rollout import Predictor, Rule
@@ -81,6 +82,8 @@ class AnimationOptions:
     unit: str = ""  # of positions in a file of trajectories
     axes: Axes = "model"  # of the wrists in a file of trajectories
     up: str = ""  # of a file of trajectories: the world axis that points up
+    hand_length_cm: float | None = None  # from the wrist joint to the tip of the middle finger; None: mean hand
+    fps: int = FPS  # of motion.npz
     calibration: str = ""  # a recording of flat hands that gives the offsets of trackers from the wrists
     mesh: MeshOptions = field(default_factory=MeshOptions)
     method: Method = "auto"  # of filling frames of a clip; "auto" chooses by their number
@@ -93,6 +96,8 @@ class AnimationOptions:
             "--trajectory-unit": self.unit,
             "--wrist-axes": "" if self.axes == "model" else self.axes,
             "--world-up": self.up,
+            "--hand-length": self.hand_length_cm,
+            "--fps": "" if self.fps == FPS else self.fps,
             "--calibration": self.calibration,
             "--unit": self.mesh.unit,
             "--hinge": self.mesh.hinge,
@@ -144,7 +149,7 @@ class Network:
 class Animation:
     """An animated clip."""
 
-    clip: Clip
+    clip: Clip  # ``fps`` frames per second
     generated: np.ndarray  # (2, frame) bool, whether the fingers of the left and right hand were generated
     ghosts: Mapping[Side, HandTrack]  # the recorded hands, shown transparent for comparison
     hands: HandPair
@@ -152,6 +157,7 @@ class Animation:
     notes: list[str]
     network_facts: Mapping[str, Any] = field(default_factory=dict)  # empty if the fingers are interpolated
     source_info: Mapping[str, Any] = field(default_factory=dict)  # of the store of an animated clip
+    fps: int = FPS
 
 
 def animate_files(
@@ -209,13 +215,13 @@ def stream_files(
 
 
 def _written(animation: Animation, out: Path, store: Path | None) -> WrittenFiles:
-    clip, hands, ghosts, generated = animation.clip, animation.hands, animation.ghosts, animation.generated
-    info = animation.source_info
+    hands, ghosts, generated, info = animation.hands, animation.ghosts, animation.generated, animation.source_info
+    arrays = motion_arrays(animation.clip, hands) | {"made": generated, "fps": np.array(animation.fps)}
+    clip = animation.clip.take(slice(None, None, animation.fps // FPS))  # of the other files
     left_objects = () if info else clip.other_objects  # those of a recorded clip are others
     sides: list[Side] = [side for side, frames in zip(SIDES, generated, strict=True) if frames.any()]
     checks = verdict(clip, hands, sides=[side for side in sides if side == "right" or not left_objects])
-    arrays = motion_arrays(clip, hands) | {"made": generated}
-    for left in left_objects:
+    for left in animation.clip.other_objects if left_objects else ():
         arrays |= {"left_object_rotvec": left.rotvec, "left_object_translation_m": left.translation_m}
     length = ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s")
     paths = write_motions(
@@ -261,7 +267,7 @@ def _from_clip(clip_id: str, options: AnimationOptions, project: ProjectData) ->
     if interpolated != sides:
         datasets = (paths.dataset, *project.datasets)  # the networks of the clip's dataset come first
         network = chosen_network(options, project._replace(datasets=datasets))
-    control, person_hands, tracks = control_from_clip(clip), hands_of(hands, *hand_shapes(clip)), dict(clip.hands)
+    control, person_hands, tracks = control_from_clip(clip), mano_hands(hands, *hand_shapes(clip)), dict(clip.hands)
     generated = np.zeros((2, clip.n_frames), bool)
     for side, gap in gaps.items():
         if network is None or side in interpolated:
@@ -390,16 +396,16 @@ def _from_tracker(
     address = parse_address(source)
     network = chosen_network(options, project)
     models, notes = _objects(options, options.mesh.unit, project)
-    mean_hands, predictor = hands_of(project.hands, np.zeros((2, 10), np.float32), None), network.predictor
-    hands: dict[Side, TrackedHand] = {side: mean_hands[side] for side in options.sides}
+    (templates_m, user_hands), predictor = _user_hands(options, project), network.predictor
+    hands: dict[Side, TrackedHand] = {side: user_hands[side] for side in options.sides}
     tracker = Tracker(address, models["right"].is_articulated, report, bool(options.left_object))
-    tracked = tracker.frames()
+    received = tracker.frames()
     if options.calibration:
         recording = read_trajectories(Path(options.calibration))
-        offsets, offset_notes = offsets_of(recording, mean_hands, options.sides)
+        offsets, offset_notes = offsets_of(recording, user_hands, options.sides)
         notes += offset_notes
-        tracked = (calibrated_frame(frame, offsets) for frame in tracked)
-    frames, poses = _played(predictor, hands, models, tracked, show)
+        received = (calibrated_frame(frame, offsets) for frame in received)
+    frames, poses = _played(predictor, hands, models, received, show)
     notes.append(f"{tracker.refused} of {tracker.received} datagrams were refused")
     control, valid = control_of_frames(frames, models["right"])
     if control and options.left_object:
@@ -409,7 +415,7 @@ def _from_tracker(
         got = f"none in {len(frames)} frames"
         raise BadInput(source, "poses of the object and of a wrist", got, "send them (docs/fingers.md)")
     fingers = _poses_of_frames(poses, predictor, hands, valid.shape[1])
-    clip = clip_of(control, fingers, UPS[options.up], "live", network.is_synthetic)
+    clip = clip_of(control, fingers, templates_m, UPS[options.up], "live", network.is_synthetic)
     generated = valid & np.array([[side in hands] for side in SIDES])
     tracks = {side: replace(clip.hands[side], valid=tracked) for side, tracked in zip(SIDES, generated, strict=True)}
     rows = [*network.rows, _objects_row(models), ("source", source)]
@@ -426,28 +432,39 @@ def _from_file(
     if bool(options.left_object) != (trajectories.left_object is not None):
         got = "only one of them"
         raise BadInput("--left-object", "a mesh and left_object columns, or neither", got, "add the other, or omit it")
-    mean_hands = hands_of(project.hands, np.zeros((2, 10), np.float32), None)
+    templates_m, user_hands = _user_hands(options, project)
     if options.calibration:
         recording = read_trajectories(Path(options.calibration), options.unit)
-        offsets, offset_notes = offsets_of(recording, mean_hands, set(options.sides) & set(trajectories.wrists))
+        offsets, offset_notes = offsets_of(recording, user_hands, set(options.sides) & set(trajectories.wrists))
         notes += offset_notes
         trajectories = calibrated_file(trajectories, offsets)
     if options.left_object:
-        given = control_of_two_objects(trajectories, models, mean_hands)
+        checked = control_of_two_objects(trajectories, models, user_hands)
     else:
-        given = control_from_file(trajectories, models["right"], mean_hands)
-    notes += [*given.notes, *_skipped_hand_notes(trajectories, given, options.sides)]
-    control = at_30_fps(given.control)
+        checked = control_from_file(trajectories, models["right"], user_hands)
+    notes += [*checked.notes, *_skipped_hand_notes(trajectories, checked, options.sides)]
+    control = at_rate(checked.control, options.fps)
     n_frames = len(control.object_motion.time_s)
     generated = np.zeros((2, n_frames), bool)
-    animated: dict[Side, TrackedHand] = {side: mean_hands[side] for side in given.active if side in options.sides}
+    animated: dict[Side, TrackedHand] = {side: user_hands[side] for side in checked.active if side in options.sides}
     fingers: dict[Side, np.ndarray] = {
-        side: np.tile(mean_hands[side].rest_rotmats, (n_frames, 1, 1, 1)) for side in trajectories.wrists
+        side: np.tile(user_hands[side].rest_rotmats, (n_frames, 1, 1, 1)) for side in trajectories.wrists
     }
-    fingers |= predict(network.predictor, animated, given.control, control)
+    fingers |= predict(network.predictor, animated, checked.control, control)
     generated[[SIDES.index(side) for side in animated]] = True
-    clip = clip_of(control, fingers, trajectories.up or UPS[options.up], path.stem, network.is_synthetic)
-    return Animation(clip, generated, {}, project.hands, [*network.rows, _objects_row(models)], notes, network.facts)
+    up = trajectories.up or UPS[options.up]
+    clip = clip_of(control, fingers, templates_m, up, path.stem, network.is_synthetic)
+    rows = [*network.rows, _objects_row(models)]
+    return Animation(clip, generated, {}, project.hands, rows, notes, network.facts, fps=options.fps)
+
+
+def _user_hands(
+    options: AnimationOptions, project: ProjectData
+) -> tuple[np.ndarray | None, Mapping[Side, TrackedHand]]:
+    """Rest meshes (2, 778, 3) of hands of the user's length, None for the mean length; and both hands."""
+    length_cm = options.hand_length_cm
+    templates_m = None if length_cm is None else project.hands.templates_of_length(length_cm / 100)
+    return templates_m, mano_hands(project.hands, templates_m=templates_m)
 
 
 def _skipped_hand_notes(trajectories: TrajectoryFile, given: AnimationInput, sides: tuple[Side, ...]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Means of rigid transforms, and which transforms of a recording at rest are no outliers."""
+"""Means of rigid transforms, and outliers in a recording at rest."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation

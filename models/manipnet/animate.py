@@ -58,22 +58,22 @@ def control_of_two_objects(
     """Likewise with an object in each hand."""
     if len(file.wrists) < len(SIDES):
         raise BadInput(file.source, "both wrists, with an object in each hand", "one", "add the other one")
-    given = {side: control_from_file(file.of(side), models[side], hands) for side in SIDES}
-    wrists: dict[Side, Motion] = {side: given[side].control.wrists[side] for side in SIDES}
-    left, right = (replace(given[side].control, wrists=wrists) for side in SIDES)
+    inputs = {side: control_from_file(file.of(side), models[side], hands) for side in SIDES}
+    wrists: dict[Side, Motion] = {side: inputs[side].control.wrists[side] for side in SIDES}
+    left, right = (replace(one.control, wrists=wrists) for one in inputs.values())
     return AnimationInput(
-        replace(right, left=left), list(SIDES), [note for side in SIDES for note in given[side].notes]
+        replace(right, left=left), list(SIDES), [note for one in inputs.values() for note in one.notes]
     )
 
 
-def at_30_fps(control: Control) -> Control:
-    """Resample trajectories at 30 fps from their first frame on. Raises BadInput for too many frames."""
+def at_rate(control: Control, fps: int = FPS) -> Control:
+    """Resample trajectories from their first frame on. Raises BadInput for too many frames."""
     first_s, last_s = control.object_motion.time_s[[0, -1]]
-    n_frames = int(np.floor((last_s - first_s) * FPS + 1e-6)) + 1
+    n_frames = int(np.floor((last_s - first_s) * fps + 1e-6)) + 1
     if n_frames > MAX_FRAMES:
-        expected = f"at most {MAX_FRAMES} frames at {FPS} per second"
+        expected = f"at most {MAX_FRAMES} frames at {fps} per second"
         raise BadInput("time_s", expected, f"{n_frames}", "cut it into pieces")
-    return control.at(first_s + np.arange(n_frames) / FPS)
+    return control.at(first_s + np.arange(n_frames) / fps)
 
 
 class Gap(NamedTuple):
@@ -156,19 +156,23 @@ def with_fingers(track: HandTrack, frames: slice, fingers: np.ndarray, wrist: Mo
     return replace(track, wrist_m=wrist_m, global_orient=global_orient, hand_pose=pose, valid=valid)
 
 
-def clip_of(control: Control, fingers: Mapping[Side, np.ndarray], up: tuple[float, float, float] | None,
-            name: str, synthetic: bool) -> Clip:  # fmt: skip
-    """A clip of trajectories at 30 fps with fingers (frame, 15, 3, 3); a hand without fingers is invalid."""
+def clip_of(control: Control, fingers: Mapping[Side, np.ndarray], templates_m: np.ndarray | None,
+            up: tuple[float, float, float] | None, name: str, synthetic: bool) -> Clip:  # fmt: skip
+    """A clip of trajectories with fingers (frame, 15, 3, 3); a hand without fingers is invalid.
+
+    templates_m: (2, 778, 3) personal rest meshes.
+    """
     n_frames = len(control.object_motion.time_s)
     tracks: dict[Side, HandTrack] = {}
-    for side in SIDES:
+    for index, side in enumerate(SIDES):
         wrist, has_fingers = control.wrists[side].at(control.object_motion.time_s), side in fingers
         hand_pose = rotmat_to_rotvec(fingers[side]).reshape(n_frames, -1) if has_fingers else np.zeros((n_frames, 45))
         wrist_m, orient, hand_pose = (
             array.astype(np.float32) for array in (wrist.translation, rotmat_to_rotvec(wrist.rotation), hand_pose)
         )
-        betas = np.zeros((1, 10), np.float32)
-        tracks[side] = HandTrack(wrist_m, orient, hand_pose, betas=betas, valid=np.full(n_frames, has_fingers))
+        betas, valid = np.zeros((1, 10), np.float32), np.full(n_frames, has_fingers)
+        template_m = None if templates_m is None else templates_m[index]
+        tracks[side] = HandTrack(wrist_m, orient, hand_pose, betas, valid, template_m)
     return Clip(
         clip_id=f"animated/{name}",
         dataset="generated",

@@ -38,7 +38,7 @@ def offsets_of(
 
 
 def calibrated_file(file: TrajectoryFile, offsets: Offsets) -> TrajectoryFile:
-    """Replace the poses of trackers by those of the wrist joints; hands without an offset are left out."""
+    """Replace the poses of trackers by those of the wrist joints; hands without an offset are skipped."""
     wrists: dict[Side, Motion] = {}
     for side, tracker in file.wrists.items():
         if side in offsets:
@@ -48,6 +48,6 @@ def calibrated_file(file: TrajectoryFile, offsets: Offsets) -> TrajectoryFile:
 
 
 def calibrated_frame(frame: TrackedFrame, offsets: Offsets) -> TrackedFrame:
-    """Replace the poses of trackers by those of the wrist joints; hands without an offset are left out."""
+    """Replace the poses of trackers by those of the wrist joints; hands without an offset are skipped."""
     wrists = {side: pose and pose @ offsets[side] for side, pose in frame.wrists.items() if side in offsets}
     return replace(frame, wrists=wrists)

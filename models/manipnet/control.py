@@ -1,8 +1,7 @@
 """ManipNet's control signal: the motions of both wrists and of the object, at any frame rate."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 
@@ -22,10 +21,7 @@ from hoidata.clips.features import (
 )
 from hoidata.geometry.motion import Motion
 from hoidata.geometry.rotations import rot6d_to_rotmat
-from hoidata.hands import HandPair
-from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
-from hoidata.sensors.mano_hand import mano_hand
 
 UNTRACKED_DISTANCE_M = 1.0  # from the object to a wrist that is never tracked: out of range of all sensors
 
@@ -116,17 +112,3 @@ def trajectories_of(sample: ClipSample) -> Trajectories:
 def finger_rotmats_of(hand_features: np.ndarray) -> np.ndarray:
     """Finger rotations (frame, 15, 3, 3) of features (frame, 99)."""
     return rot6d_to_rotmat(hand_features[:, HAND_POSE_6D].astype(np.float64).reshape(-1, N_ROTATIONS - 1, 6))
-
-
-def hands_of(pair: HandPair, betas: np.ndarray, template_m: np.ndarray | None) -> Mapping[Side, TrackedHand]:
-    """Both hands of a person; betas: (2, 10); template_m: personal rest meshes (2, 778, 3) or None."""
-    templates = [None, None] if template_m is None else [template.tobytes() for template in template_m]
-    return {side: _tracked(pair, side, betas[i].tobytes(), templates[i]) for i, side in enumerate(SIDES)}
-
-
-@lru_cache(maxsize=64)
-def _tracked(pair: HandPair, side: Side, betas: bytes, template: bytes | None) -> TrackedHand:
-    """Cached, because a person's hand is in many clips and takes long to build."""
-    shape = np.frombuffer(betas, np.float32).astype(np.float64)
-    rest = None if template is None else np.frombuffer(template, np.float32).reshape(-1, 3).astype(np.float64)
-    return mano_hand(pair, side, shape, rest)

@@ -32,6 +32,10 @@ MeshHinge = Annotated[
 ]
 Moving = Annotated[str, typer.Option(help="What moves: joint of a URDF, or pieces of a mesh with --hinge.")]
 LeftObject = Annotated[str, typer.Option(help="Another rigid object in the left hand (docs/fingers.md).")]
+HandLength = Annotated[
+    float | None,
+    typer.Option(help="Own hand's length in cm, wrist joint to middle fingertip. Default: the mean.", min=12, max=26),
+]
 Calibration = Annotated[
     str, typer.Option(help="A recording of flat hands that calibrates trackers to the wrists (docs/fingers.md).")
 ]
@@ -224,6 +228,7 @@ def animate(
     ] = "model",
     left_object: LeftObject = "",
     calibration: Calibration = "",
+    hand_length: HandLength = None,
     world_up: WorldUp = "",
     unit: MeshUnit = "",
     hinge: MeshHinge = "",
@@ -235,6 +240,9 @@ def animate(
             help="How to fill frames of a clip. auto: interpolate gaps up to 2 s between known poses, else network."
         ),
     ] = "auto",
+    fps: Annotated[
+        Literal["30", "60", "120"], typer.Option(help="Frames per second of motion.npz; other files have 30.")
+    ] = "30",
     profile: Profile = "",
 ) -> None:
     """Generate finger motion for given wrist and object trajectories; write arrays, an animated GLB and a web page."""
@@ -255,7 +263,9 @@ def animate(
         axes=wrist_axes,
         up=world_up,
         calibration=calibration,
+        hand_length_cm=hand_length,
         mesh=MeshOptions(unit, "", hinge, moving, scale),
+        fps=int(fps),
         method=way,
     )
     _print_written(animate_files(source, options, *project, out, store))
@@ -275,6 +285,7 @@ def stream(
     model: Annotated[str, typer.Option(help="Dataset whose network to use. Default: the first with a network.")] = "",
     left_object: LeftObject = "",
     calibration: Calibration = "",
+    hand_length: HandLength = None,
     world_up: WorldUp = "",
     unit: MeshUnit = "",
     hinge: MeshHinge = "",
@@ -299,6 +310,7 @@ def stream(
         left_object=left_object,
         up=world_up,
         calibration=calibration,
+        hand_length_cm=hand_length,
         mesh=MeshOptions(unit, "", hinge, moving, scale),
     )
 

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.errors import BadInput
 from hoidata.geometry.transform import RigidTransform
-from hoidata.hands import load_embedded_hands
+from hoidata.hands import TIP_VERTICES, load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.hands.tracker_offset import sheet_from_wrist
 from hoidata.sensors.mano_hand import mano_hand
@@ -123,7 +123,7 @@ def write_tea_files(folder: Path) -> None:
         left += [pot, wrist, right]
     (folder / "tea.csv").write_text(table(both, ("object", "right", "left_object", "left")))
     (folder / "right.csv").write_text(
-        table([row for i, row in enumerate(both) if i % 4 != 2], ("object", "right", "left"))
+        table([pose for i, pose in enumerate(both) if i % 4 != 2], ("object", "right", "left"))
     )
     (folder / "left.csv").write_text(table(left, ("object", "left", "right")))
 
@@ -165,7 +165,7 @@ def typed(tiny: Path, monkeypatch: pytest.MonkeyPatch):
         if isinstance(done.exception, Exception):
             raise done.exception
         assert done.exit_code == 0, done.output
-        assert [Path(line).name for line in done.stdout.split()] == ["motion.npz", "motion.glb", "index.html"]
+        assert [Path(line).name for line in done.stdout.split()][:3] == ["motion.npz", "motion.glb", "index.html"]
         assert "does the verb: the object's motion was given, without a verb" in done.stderr
         assert (tiny / "out" / "motion.glb").read_bytes()[:4] == b"glTF"
         return dict(np.load("out/motion.npz")), Path("out/index.html").read_text()
@@ -214,7 +214,7 @@ def test_a_tracker_over_udp_is_calibrated_too(tiny: Path, monkeypatch) -> None:
     words = ("--object", "mug.obj", "--fingers", "right")
     expected, poses = streamed("mine.csv", *words), streamed("strapped.csv", *words, "--calibration", "flat.csv")
     assert len(poses) == len(expected) == 4
-    np.testing.assert_allclose(*([pose["right"] for pose in given] for given in (poses, expected)), atol=1e-4)
+    np.testing.assert_allclose(*([pose["right"] for pose in hand_poses] for hand_poses in (poses, expected)), atol=1e-4)
 
 
 def test_each_hand_holds_its_own_object_and_the_files_have_both(tiny: Path, typed, monkeypatch) -> None:
@@ -253,6 +253,33 @@ def test_a_scale_changes_the_mesh_and_not_the_trajectories(tiny: Path, typed) ->
     assert np.abs(scaled["hand_pose"] - plain["hand_pose"]).max() > 1e-4
     for name in ("wrist_m", "object_translation_m", "object_rotvec"):
         np.testing.assert_array_equal(scaled[name], plain[name])
+
+
+def test_the_hand_has_the_given_length_in_all_results(tiny: Path, typed) -> None:
+    model = load_embedded_hands().right
+    mean_cm = 100 * np.linalg.norm(model.template_m[TIP_VERTICES[1]] - model.wrist_offset_m(np.zeros(10)))
+    plain, _ = typed("mine.csv", "--object", "mug.obj")
+    store = tiny / "long-hand"
+    arrays, _ = typed("mine.csv", "--object", "mug.obj", "--hand-length", f"{1.1 * mean_cm}", "--store", str(store))
+    palms_m = [result["joints_m"][1, :, 4] - result["joints_m"][1, :, 0] for result in (arrays, plain)]
+    np.testing.assert_allclose(
+        *(np.linalg.norm(palm_m, axis=1) * k for palm_m, k in zip(palms_m, (1, 1.1), strict=True)), rtol=1e-5
+    )
+    np.testing.assert_allclose(arrays["template_m"][1], 1.1 * model.template_m, atol=1e-6)
+    np.testing.assert_array_equal(arrays["wrist_m"], plain["wrist_m"])
+    assert np.abs(arrays["hand_pose"] - plain["hand_pose"]).max() > 1e-4
+    np.testing.assert_allclose(open_store(store).joints("animated/mine", "right"), arrays["joints_m"][1], atol=1e-5)
+
+
+def test_motion_npz_has_the_given_frame_rate_and_the_other_files_have_30(typed) -> None:
+    plain, _ = typed("mine.csv", "--object", "mug.obj")
+    arrays, page = typed("mine.csv", "--object", "mug.obj", "--fps", "60")
+    assert arrays["fps"] == 60
+    assert arrays["made"].shape == (2, 7)
+    assert "4 frames, 0.13 s" in page
+    for name in ("wrist_m", "hand_pose", "object_translation_m"):
+        np.testing.assert_allclose(arrays[name][..., ::2, :], plain[name], atol=1e-3)
+    np.testing.assert_allclose(arrays["object_translation_m"][:, 0], np.arange(7) * 0.005, atol=1e-6)
 
 
 def test_manipnets_text_file_and_mesh_are_mirrored(typed) -> None:

@@ -33,8 +33,8 @@ def motion(poses: RigidTransform) -> Motion:
 
 def noisy(poses: RigidTransform, rng: np.random.Generator, distance_m: float, angle_rad: float) -> RigidTransform:
     count = len(poses.rotation)
-    turn = Rotation.from_rotvec(rng.normal(0, angle_rad, (count, 3))).as_matrix()
-    return RigidTransform(poses.rotation @ turn, poses.translation + rng.normal(0, distance_m, (count, 3)))
+    rotation_error = Rotation.from_rotvec(rng.normal(0, angle_rad, (count, 3))).as_matrix()
+    return RigidTransform(poses.rotation @ rotation_error, poses.translation + rng.normal(0, distance_m, (count, 3)))
 
 
 def recording(
@@ -50,8 +50,10 @@ def recording(
 
 def errors(motion: Motion, expected: RigidTransform) -> tuple[float, float]:
     """Largest distance in metres and angle in degrees between two motions."""
-    turn = Rotation.from_matrix(motion.rotmats.swapaxes(1, 2) @ expected.rotation)
-    return float(abs(motion.position_m - expected.translation).max()), float(np.degrees(turn.magnitude()).max())
+    rotation_error = Rotation.from_matrix(motion.rotmats.swapaxes(1, 2) @ expected.rotation)
+    return float(abs(motion.position_m - expected.translation).max()), float(
+        np.degrees(rotation_error.magnitude()).max()
+    )
 
 
 def scene(seed: int) -> tuple[dict[Side, RigidTransform], dict[Side, RigidTransform], TrajectoryFile, TrajectoryFile]:
@@ -152,13 +154,14 @@ def test_an_unusable_recording_is_refused(fault: str, answer: str) -> None:
     side: Side = "left" if fault == "left only" else "right"
     offset = RigidTransform(np.eye(3), np.array([0.0, 0.02, 0.4 if fault == "far" else 0.04]))
     sheet = RigidTransform(np.eye(3)[None], np.zeros((1, 3)))
-    given = recording({side: offset}, sheet, RATE_HZ // 2 if fault == "short" else REST_FRAMES)
+    unusable = recording({side: offset}, sheet, RATE_HZ // 2 if fault == "short" else REST_FRAMES)
     if fault == "moved":
-        given.wrists["right"].position_m[:, 0] += np.linspace(0, 0.03, REST_FRAMES)
+        unusable.wrists["right"].position_m[:, 0] += np.linspace(0, 0.03, REST_FRAMES)
     if fault == "turned":
-        turn = Rotation.from_rotvec(np.linspace([0, 0, 0], [0, 0, np.radians(16)], REST_FRAMES)).as_matrix()
-        given = replace(
-            given, wrists={"right": replace(given.wrists["right"], rotmats=turn @ given.wrists["right"].rotmats)}
+        rotating = Rotation.from_rotvec(np.linspace([0, 0, 0], [0, 0, np.radians(16)], REST_FRAMES)).as_matrix()
+        unusable = replace(
+            unusable,
+            wrists={"right": replace(unusable.wrists["right"], rotmats=rotating @ unusable.wrists["right"].rotmats)},
         )
     with pytest.raises(BadInput, match=answer):
-        offsets_of(given, HANDS, ["right"])
+        offsets_of(unusable, HANDS, ["right"])

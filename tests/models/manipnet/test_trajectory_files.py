@@ -14,7 +14,7 @@ from hoidata.geometry.motion import Motion
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.user_mesh import UNITS_M
 from hoidata.sensors.mano_hand import mano_hand
-from models.manipnet.animate import at_30_fps, blend_ends, control_from_file, interpolated
+from models.manipnet.animate import at_rate, blend_ends, control_from_file, interpolated
 from models.manipnet.control import Control
 from models.manipnet.plausible import reading
 from models.manipnet.trajectory_files import PARTS, Axes, parse_csv, parse_manipnet, read_trajectories
@@ -101,25 +101,25 @@ def test_a_table_is_read_with_its_columns_in_any_order() -> None:
 
 @pytest.mark.parametrize("lost", [",nan", ","])
 def test_frames_in_which_a_body_is_lost_are_left_out_and_long_gaps_are_refused(lost: str) -> None:
-    head, *rows = table().splitlines()
+    head, *lines = table().splitlines()
     whole = checked_control(table()).control.at(np.arange(FRAMES) / 30)
 
     def without(body: str, frames: slice) -> str:
         first = 1 if body == "object" else 8
-        cells = [row.split(",") for row in rows]
-        for row in cells[frames]:
-            row[first : first + 7] = lost.split(",")[1:] * 7
-        return "\n".join([head, *map(",".join, cells)])
+        table_cells = [line.split(",") for line in lines]
+        for cells in table_cells[frames]:
+            cells[first : first + 7] = lost.split(",")[1:] * 7
+        return "\n".join([head, *map(",".join, table_cells)])
 
     for body in ("object", "right"):
-        given = checked_control(without(body, slice(2, 4)))
-        assert given.active == ["right"]
-        control = given.control.at(np.arange(FRAMES) / 30)
+        checked = checked_control(without(body, slice(2, 4)))
+        assert checked.active == ["right"]
+        control = checked.control.at(np.arange(FRAMES) / 30)
         np.testing.assert_allclose(control.wrists["right"].position_m, whole.wrists["right"].position_m, atol=1e-3)
         np.testing.assert_allclose(control.object_motion.rotmats, whole.object_motion.rotmats, atol=1e-3)
     with pytest.raises(BadInput, match="neither"):
         parse_csv(without("right", slice(None)).encode(), "mine.csv")
-    rows = with_last_time("1.1").splitlines()[1:]
+    lines = with_last_time("1.1").splitlines()[1:]
     for frames, words in ((slice(1, None), "right lost for 1.10 s; cut"), (slice(1, 5), "right lost for 1.10 s; cut")):
         with pytest.raises(BadInput, match=f"gaps of at most 1 s, got {words}"):
             parse_csv(without("right", frames).encode(), "mine.csv")
@@ -214,7 +214,7 @@ def test_too_many_frames_at_30_per_second_are_refused() -> None:
     times = np.linspace(0, 1e9, 3)
     still = Motion(times, np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3)))
     with pytest.raises(BadInput, match="at most 200000 frames"):
-        at_30_fps(Control(dict.fromkeys(SIDES, still), still, BOX))
+        at_rate(Control(dict.fromkeys(SIDES, still), still, BOX))
 
 
 def test_quaternions_with_w_last_are_refused_in_nearly_every_world_and_w_first_in_none() -> None:
