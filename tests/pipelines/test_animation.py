@@ -350,6 +350,8 @@ def test_motion_of_a_network_trained_on_synthetic_clips_is_marked(tiny: Path, ty
         ((TRAINED, "--left-object", "pot.obj"), "--left-object: expected no such option with a clip"),
         (("tea.csv", "--object", "mug.obj"), "a mesh and left_object columns, or neither"),
         (("right.csv", "--object", "mug.obj", "--left-object", "pot.obj"), "a mesh and left_object columns"),
+        ((TRAINED, "--fps", "60"), "--fps: expected no such option with a clip"),
+        ((TRAINED, "--hand-length", "18"), "--hand-length: expected no such option with a clip"),
         ((TRAINED, "--scale", "2"), "--scale: expected no such option with a clip"),
         (("strapped.csv", "--object", "mug.obj", "--calibration", "flat.csv", "--wrist-axes", "canonical"), "omit it"),
         (("demo1.txt", "--object", "cyl_med.obj", "--calibration", "flat.csv"), "the tracker on the left hand"),
