@@ -23,13 +23,15 @@ import trimesh
 
 from bench.harness import show
 from hoidata.clips.clip import SIDES, Side
+from hoidata.geometry.motion import Motion
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
+from hoidata.sensors.mano_hand import mano_hands
 from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import load_checkpoint
-from models.manipnet.control import Control, Motion, control_from_clip, hands_of
+from models.manipnet.control import Control, control_from_clip
 from models.manipnet.network import ManipNet
 from models.manipnet.rollout import Predictor
 from models.manipnet.stream import Stream, TrackedFrame, tracked_frames
@@ -256,7 +258,7 @@ def main() -> None:
     acting = [clip_id for clip_id in clips.store.ids if clips.hand_types.at[clip_id, "hand_type"] in ("right", "both")]
     ids = np.resize(np.random.default_rng(0).permutation(acting), count)
     controls = [forward_and_back(control_from_clip(clips.clip(clip_id)), CLIP_S) for clip_id in ids]
-    result = soak(Predictor(checkpoint.network), hands_of(pair, np.zeros((2, 10), np.float32), None), controls)
+    result = soak(Predictor(checkpoint.network), mano_hands(pair, np.zeros((2, 10), np.float32), None), controls)
     rows = []
     for kind in KINDS:
         chosen = np.array([fault.kind == kind for fault in result.faults])

@@ -4,7 +4,7 @@ import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from functools import partial
 from os.path import isfile  # returns False for a name that is too long, where Path.is_file raises
 from pathlib import Path
@@ -20,21 +20,24 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.metrics.verdict import summary, verdict, verdict_lines
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import is_object_path, read_user_object
+from hoidata.sensors.mano_hand import mano_hands
 from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import load_checkpoint
 from models.common.repeatable import make_repeatable
 from models.manipnet.animate import (
     AnimationInput,
     Gap,
-    at_30_fps,
+    at_rate,
     clip_of,
     control_from_file,
+    control_of_two_objects,
     gap_of,
     interpolate_fingers,
     predict_fingers,
     with_fingers,
 )
-from models.manipnet.control import Control, control_from_clip, hands_of
+from models.manipnet.calibration import calibrated_file, calibrated_frame, offsets_of
+from models.manipnet.control import Control, control_from_clip
 from models.manipnet.datagrams import Tracker, parse_address, pose_line
 from models.manipnet.network import ManipNet
 from models.manipnet.rollout import Predictor, Rule
@@ -58,7 +61,11 @@ from pipelines.show_pages import dataset_of_clip
 from pipelines.stages.base import StagePaths, load_hands
 
 Method = Literal["auto", "network", "interpolate"]
-ARRAYS = SHARED | {"made": "(S, F) whether the fingers were generated"}
+ARRAYS = SHARED | {
+    "made": "(S, F) whether the fingers were generated",
+    "left_object_rotvec": "(F, 3) as object_rotvec, of another object in the left hand",
+    "left_object_translation_m": "(F, 3) as object_translation_m",
+}
 UPS = {"": None, "x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -71,9 +78,13 @@ class AnimationOptions:
     model: str = ""  # the dataset whose network to use; "" for the clip's dataset, else the first that has one
     rule: Rule = "preset"
     object: str = ""  # of a file of trajectories: a mesh file, or the name of an object of the dataset
+    left_object: str = ""  # the same, if the left hand has another object
     unit: str = ""  # of positions in a file of trajectories
     axes: Axes = "model"  # of the wrists in a file of trajectories
     up: str = ""  # of a file of trajectories: the world axis that points up
+    hand_length_cm: float | None = None  # from the wrist joint to the tip of the middle finger; None: mean hand
+    fps: int = FPS  # of motion.npz
+    calibration: str = ""  # a recording of flat hands that gives the offsets of trackers from the wrists
     mesh: MeshOptions = field(default_factory=MeshOptions)
     method: Method = "auto"  # of filling frames of a clip; "auto" chooses by their number
 
@@ -81,12 +92,17 @@ class AnimationOptions:
         """Raise BadInput for an option that applies only to a file of trajectories."""
         file_options = {
             "--object": self.object,
+            "--left-object": self.left_object,
             "--trajectory-unit": self.unit,
             "--wrist-axes": "" if self.axes == "model" else self.axes,
             "--world-up": self.up,
+            "--hand-length": self.hand_length_cm,
+            "--fps": "" if self.fps == FPS else self.fps,
+            "--calibration": self.calibration,
             "--unit": self.mesh.unit,
             "--hinge": self.mesh.hinge,
             "--moving": self.mesh.moving,
+            "--scale": "" if self.mesh.scale == 1 else self.mesh.scale,
         }
         for option, value in file_options.items():
             if value:
@@ -99,6 +115,8 @@ class AnimationOptions:
         if self.method == "interpolate":
             remedy = "omit it: a file of trajectories has no poses to interpolate between"
             raise BadInput("--way", "network or auto with a file of trajectories", self.method, remedy)
+        if self.calibration and self.axes != "model":
+            raise BadInput("--wrist-axes", "none with --calibration, which measures them", self.axes, "omit it")
         if self.up not in UPS:
             raise BadInput("--world-up", "x, y or z", self.up, "name the axis of the file's world that points up")
 
@@ -131,7 +149,7 @@ class Network:
 class Animation:
     """An animated clip."""
 
-    clip: Clip
+    clip: Clip  # ``fps`` frames per second
     generated: np.ndarray  # (2, frame) bool, whether the fingers of the left and right hand were generated
     ghosts: Mapping[Side, HandTrack]  # the recorded hands, shown transparent for comparison
     hands: HandPair
@@ -139,6 +157,7 @@ class Animation:
     notes: list[str]
     network_facts: Mapping[str, Any] = field(default_factory=dict)  # empty if the fingers are interpolated
     source_info: Mapping[str, Any] = field(default_factory=dict)  # of the store of an animated clip
+    fps: int = FPS
 
 
 def animate_files(
@@ -196,13 +215,19 @@ def stream_files(
 
 
 def _written(animation: Animation, out: Path, store: Path | None) -> WrittenFiles:
-    clip, hands, ghosts, generated = animation.clip, animation.hands, animation.ghosts, animation.generated
-    checks = verdict(clip, hands, sides=[side for side, frames in zip(SIDES, generated, strict=True) if frames.any()])
+    hands, ghosts, generated, info = animation.hands, animation.ghosts, animation.generated, animation.source_info
+    arrays = motion_arrays(animation.clip, hands) | {"made": generated, "fps": np.array(animation.fps)}
+    clip = animation.clip.take(slice(None, None, animation.fps // FPS))  # of the other files
+    left_objects = () if info else clip.other_objects  # those of a recorded clip are others
+    sides: list[Side] = [side for side, frames in zip(SIDES, generated, strict=True) if frames.any()]
+    checks = verdict(clip, hands, sides=[side for side in sides if side == "right" or not left_objects])
+    for left in animation.clip.other_objects if left_objects else ():
+        arrays |= {"left_object_rotvec": left.rotvec, "left_object_translation_m": left.translation_m}
     length = ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s")
     paths = write_motions(
         out,
         "animation.html",
-        [MotionFiles(clip, motion_arrays(clip, hands) | {"made": generated}, ghosts=ghosts)],
+        [MotionFiles(clip, arrays, ghosts=ghosts)],
         hands,
         ARRAYS,
         title=clip.clip_id,
@@ -212,7 +237,6 @@ def _written(animation: Animation, out: Path, store: Path | None) -> WrittenFile
         facts=[*animation.facts, length, ("hand model", hands.name)],
         verdicts=[("", summary(checks), checks)],
     )
-    info = animation.source_info
     stored = replace(clip, clip_id=f"{clip.clip_id}~0") if info else clip
     paths += write_motion_store(store, [stored], hands, animation.network_facts, **info)
     return WrittenFiles(paths, animation.notes, verdict_lines(0, checks))
@@ -243,7 +267,7 @@ def _from_clip(clip_id: str, options: AnimationOptions, project: ProjectData) ->
     if interpolated != sides:
         datasets = (paths.dataset, *project.datasets)  # the networks of the clip's dataset come first
         network = chosen_network(options, project._replace(datasets=datasets))
-    control, person_hands, tracks = control_from_clip(clip), hands_of(hands, *hand_shapes(clip)), dict(clip.hands)
+    control, person_hands, tracks = control_from_clip(clip), mano_hands(hands, *hand_shapes(clip)), dict(clip.hands)
     generated = np.zeros((2, clip.n_frames), bool)
     for side, gap in gaps.items():
         if network is None or side in interpolated:
@@ -315,20 +339,21 @@ def _stream_fingers(
     in_real_time: bool,
 ) -> dict[Side, np.ndarray]:
     frames = tracked_frames(tracked)
-    _, poses = _played(predictor, hands, control.model, _at_recorded_speed(frames) if in_real_time else frames, show)
+    models: dict[Side, ObjectModel] = {side: control.of(side).model for side in SIDES}
+    _, poses = _played(predictor, hands, models, _at_recorded_speed(frames) if in_real_time else frames, show)
     return _poses_of_frames(poses, predictor, hands, len(control.object_motion.time_s))
 
 
 def _played(
     predictor: Predictor,
     hands: Mapping[Side, TrackedHand],
-    model: ObjectModel,
+    models: dict[Side, ObjectModel],
     frames: Iterable[TrackedFrame],
     show: ShowPoses,
 ) -> tuple[list[TrackedFrame], list[dict[Side, np.ndarray]]]:
     """Push frames through a stream; return those that are not late, with times of its clock, and all poses."""
     start: dict[Side, np.ndarray] = {side: hand.rest_rotmats for side, hand in hands.items()}
-    stream = Stream(predictor, hands, dict.fromkeys(hands, model), start)
+    stream = Stream(predictor, hands, models, start)
     accepted, shown = list[TrackedFrame](), list[dict[Side, np.ndarray]]()
 
     def show_all(poses: list[dict[Side, np.ndarray]]) -> None:
@@ -370,21 +395,30 @@ def _from_tracker(
     """Animate a tracker's frames until they end; a hand is invalid while its wrist is lost."""
     address = parse_address(source)
     network = chosen_network(options, project)
-    model, notes = _object(options, options.mesh.unit, project)
-    mean_hands, predictor = hands_of(project.hands, np.zeros((2, 10), np.float32), None), network.predictor
-    hands: dict[Side, TrackedHand] = {side: mean_hands[side] for side in options.sides}
-    tracker = Tracker(address, model.is_articulated, report)
-    frames, poses = _played(predictor, hands, model, tracker.frames(), show)
+    models, notes = _objects(options, options.mesh.unit, project)
+    (templates_m, user_hands), predictor = _user_hands(options, project), network.predictor
+    hands: dict[Side, TrackedHand] = {side: user_hands[side] for side in options.sides}
+    tracker = Tracker(address, models["right"].is_articulated, report, bool(options.left_object))
+    received = tracker.frames()
+    if options.calibration:
+        recording = read_trajectories(Path(options.calibration))
+        offsets, offset_notes = offsets_of(recording, user_hands, options.sides)
+        notes += offset_notes
+        received = (calibrated_frame(frame, offsets) for frame in received)
+    frames, poses = _played(predictor, hands, models, received, show)
     notes.append(f"{tracker.refused} of {tracker.received} datagrams were refused")
-    control, valid = control_of_frames(frames, model)
+    control, valid = control_of_frames(frames, models["right"])
+    if control and options.left_object:
+        left, _ = control_of_frames(frames, models["left"], "left")
+        control = left and replace(control, left=left)
     if control is None or not valid[[side in hands for side in SIDES]].any():
         got = f"none in {len(frames)} frames"
         raise BadInput(source, "poses of the object and of a wrist", got, "send them (docs/fingers.md)")
     fingers = _poses_of_frames(poses, predictor, hands, valid.shape[1])
-    clip = clip_of(control, fingers, UPS[options.up], "live", network.is_synthetic)
+    clip = clip_of(control, fingers, templates_m, UPS[options.up], "live", network.is_synthetic)
     generated = valid & np.array([[side in hands] for side in SIDES])
     tracks = {side: replace(clip.hands[side], valid=tracked) for side, tracked in zip(SIDES, generated, strict=True)}
-    rows = [*network.rows, ("object", model.name), ("source", source)]
+    rows = [*network.rows, _objects_row(models), ("source", source)]
     return Animation(replace(clip, hands=tracks), generated, {}, project.hands, rows, notes, network.facts)
 
 
@@ -394,21 +428,43 @@ def _from_file(
     options.check_for_file()
     trajectories = read_trajectories(path, options.unit, options.axes)
     network = chosen_network(options, project)
-    model, notes = _object(options, options.mesh.unit or trajectories.mesh_unit, project)
-    mean_hands = hands_of(project.hands, np.zeros((2, 10), np.float32), None)
-    given = control_from_file(trajectories, model, mean_hands)
-    notes += [*given.notes, *_skipped_hand_notes(trajectories, given, options.sides)]
-    control = at_30_fps(given.control)
+    models, notes = _objects(options, options.mesh.unit or trajectories.mesh_unit, project)
+    if bool(options.left_object) != (trajectories.left_object is not None):
+        got = "only one of them"
+        raise BadInput("--left-object", "a mesh and left_object columns, or neither", got, "add the other, or omit it")
+    templates_m, user_hands = _user_hands(options, project)
+    if options.calibration:
+        recording = read_trajectories(Path(options.calibration), options.unit)
+        offsets, offset_notes = offsets_of(recording, user_hands, set(options.sides) & set(trajectories.wrists))
+        notes += offset_notes
+        trajectories = calibrated_file(trajectories, offsets)
+    if options.left_object:
+        checked = control_of_two_objects(trajectories, models, user_hands)
+    else:
+        checked = control_from_file(trajectories, models["right"], user_hands)
+    notes += [*checked.notes, *_skipped_hand_notes(trajectories, checked, options.sides)]
+    control = at_rate(checked.control, options.fps)
     n_frames = len(control.object_motion.time_s)
     generated = np.zeros((2, n_frames), bool)
-    animated: dict[Side, TrackedHand] = {side: mean_hands[side] for side in given.active if side in options.sides}
+    animated: dict[Side, TrackedHand] = {side: user_hands[side] for side in checked.active if side in options.sides}
     fingers: dict[Side, np.ndarray] = {
-        side: np.tile(mean_hands[side].rest_rotmats, (n_frames, 1, 1, 1)) for side in trajectories.wrists
+        side: np.tile(user_hands[side].rest_rotmats, (n_frames, 1, 1, 1)) for side in trajectories.wrists
     }
-    fingers |= predict(network.predictor, animated, given.control, control)
+    fingers |= predict(network.predictor, animated, checked.control, control)
     generated[[SIDES.index(side) for side in animated]] = True
-    clip = clip_of(control, fingers, trajectories.up or UPS[options.up], path.stem, network.is_synthetic)
-    return Animation(clip, generated, {}, project.hands, [*network.rows, ("object", model.name)], notes, network.facts)
+    up = trajectories.up or UPS[options.up]
+    clip = clip_of(control, fingers, templates_m, up, path.stem, network.is_synthetic)
+    rows = [*network.rows, _objects_row(models)]
+    return Animation(clip, generated, {}, project.hands, rows, notes, network.facts, fps=options.fps)
+
+
+def _user_hands(
+    options: AnimationOptions, project: ProjectData
+) -> tuple[np.ndarray | None, Mapping[Side, TrackedHand]]:
+    """Rest meshes (2, 778, 3) of hands of the user's length, None for the mean length; and both hands."""
+    length_cm = options.hand_length_cm
+    templates_m = None if length_cm is None else project.hands.templates_of_length(length_cm / 100)
+    return templates_m, mano_hands(project.hands, templates_m=templates_m)
 
 
 def _skipped_hand_notes(trajectories: TrajectoryFile, given: AnimationInput, sides: tuple[Side, ...]) -> list[str]:
@@ -421,16 +477,32 @@ def _skipped_hand_notes(trajectories: TrajectoryFile, given: AnimationInput, sid
     return [f"the {side} hand was not requested (--fingers) and keeps its neutral pose" for side in skipped]
 
 
+def _objects(options: AnimationOptions, unit: str, project: ProjectData) -> tuple[dict[Side, ObjectModel], list[str]]:
+    """The object of each hand, by default one for both; and notes for the user."""
+    model, notes = _object(options, unit, project)
+    if not options.left_object:
+        return dict.fromkeys(SIDES, model), notes
+    mesh = replace(options.mesh, hinge="", moving="")
+    left, left_notes = _object(replace(options, object=options.left_object, mesh=mesh), unit, project)
+    if left.is_articulated:
+        raise BadInput("--left-object", "a rigid object", "one with a joint", "swap the hands, or join its parts")
+    return {"left": left, "right": model}, notes + left_notes
+
+
+def _objects_row(models: Mapping[Side, ObjectModel]) -> tuple[str, str]:
+    return "object", ", ".join(dict.fromkeys(models[side].name for side in ("right", "left")))
+
+
 def _object(options: AnimationOptions, unit: str, project: ProjectData) -> tuple[ObjectModel, list[str]]:
     """A mesh file in its stored axes, or an object of the dataset; and notes for the user."""
     if is_object_path(options.object):
         # The trajectories give the mesh's orientation, so the mesh is not rotated upright.
-        user = read_user_object(Path(options.object), unit, "z", options.mesh.hinge, options.mesh.moving)
+        user = read_user_object(Path(options.object), *astuple(replace(options.mesh, unit=unit, up="z")))
         return user.model, list(user.notes)
     if not options.object:
         raise BadInput("--object", "the mesh of the object (.obj, .ply, .stl, .glb)", "none", "name it")
     paths = StagePaths(project.profile, options.model or project.datasets[0])
-    return stored_object(options.object, paths.clips, project.hands), []
+    return stored_object(options.object, paths.clips, project.hands).scaled(options.mesh.scale), []
 
 
 def chosen_network(options: AnimationOptions, project: ProjectData) -> Network:

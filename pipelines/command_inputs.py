@@ -33,6 +33,7 @@ class MeshOptions:
     up: str = ""
     hinge: str = ""
     moving: str = ""
+    scale: float = 1.0  # factor on the mesh
 
 
 @dataclass(frozen=True)

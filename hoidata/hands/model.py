@@ -105,6 +105,13 @@ class HandPair:
     def name(self) -> str:
         return self.right.name
 
+    def templates_of_length(self, length_m: float) -> np.ndarray:
+        """(2, 778, 3) float32 rest meshes, scaled to a length from the wrist joint to the tip of the middle finger."""
+        tips = [model.template_m[TIP_VERTICES[1]] for model in (self.left, self.right)]
+        wrists = [model.wrist_offset_m(np.zeros(N_SHAPE)) for model in (self.left, self.right)]
+        factor = length_m / np.linalg.norm(np.subtract(tips, wrists), axis=1)
+        return (factor[:, None, None] * [self.left.template_m, self.right.template_m]).astype(np.float32)
+
     @cached_property
     def digest(self) -> str:
         """SHA-256 of both models' digests."""

@@ -119,6 +119,13 @@ class TrackedHand:
         radius[self.capsules.joint[fingers]] = self.capsules.radius_m[fingers]
         return radius
 
+    @property
+    def palm_depth_m(self) -> float:
+        """How far the palm's skin reaches below the wrist joint, along the back's normal; the hand is flat."""
+        flat = self.state(np.tile(np.eye(3), (1, self.n_joints - 1, 1, 1)))
+        is_palm = self.skin.weight[N_TIPS:].argmax(axis=1) == 0
+        return float(-(flat.sensor_m[0, is_palm] @ self.wrist_from_canonical)[:, 2].min())
+
     def state(self, finger_rotmats: np.ndarray) -> HandState:
         """Pose the hand, in the wrist's frame. finger_rotmats: (frame, joint - 1, 3, 3) relative to the parent."""
         finger_rotmats = np.asarray(finger_rotmats, dtype=np.float64)

@@ -1,7 +1,7 @@
 """The canonical object: a triangle mesh in metres, its parts, and the hinge between them."""
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -82,6 +82,11 @@ class ObjectModel:
     def scale_m(self) -> float:
         """Distance of the farthest vertex from the mean of all vertices, the ``s_obj`` of Text2HOI, Sec. 3.1."""
         return float(np.linalg.norm(self.vertices_m - self.vertices_m.mean(axis=0), axis=1).max())
+
+    def scaled(self, factor: float) -> "ObjectModel":
+        """The object, scaled about the origin of its frame."""
+        hinge = self.hinge and replace(self.hinge, origin_m=factor * self.hinge.origin_m)
+        return replace(self, vertices_m=factor * self.vertices_m, hinge=hinge)
 
     @property
     def parts(self) -> list[int]:

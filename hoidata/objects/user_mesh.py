@@ -48,7 +48,9 @@ def is_object_path(name: str) -> bool:
     return isfile(name) or (isdir(name) and find_urdf(Path(name)) is not None)
 
 
-def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "", moving: str = "") -> UserObject:
+def read_user_object(
+    path: Path, unit: str = "", up: str = "", hinge: str = "", moving: str = "", factor: float = 1.0
+) -> UserObject:
     """Read an object from an OBJ, PLY, STL, GLB or URDF file, or from a folder with a URDF file.
 
     Args:
@@ -58,6 +60,7 @@ def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "", 
             "dx,dy,dz", the direction of a slide. The mesh must have two pieces, of which the second in the file moves.
             Pieces are the objects, groups, nodes or solids that the file names if there are two, else the shells.
         moving: what moves: the joint of a URDF, or the objects, groups or nodes of a mesh, separated by commas.
+        factor: by which the mesh is scaled about its origin.
 
     Raises:
         BadInput: the size is implausible (the error suggests a unit), or the joint does not fit.
@@ -66,7 +69,7 @@ def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "", 
         raise BadInput("--moving", "--hinge too, the axis of what moves", moving[:80], "give both")
     body = _body(path, hinge, moving)
     mesh, notes = body.mesh, list(body.notes)
-    scale = _scale(path, mesh, unit)
+    scale = _scale(path, mesh, unit, factor)
     vertices = mesh.vertices * scale
     if not up:
         up, note = _usual_up(path) or guess_up(vertices)
@@ -295,14 +298,14 @@ def _merged_within_source(file: _MeshFile) -> np.ndarray:
     return distinct_rows(np.column_stack((np.round(file.mesh.vertices * MERGE_PRECISION), file.source))).number
 
 
-def _scale(path: Path, mesh: Mesh, unit: str) -> float:
-    """Metres per unit of the file, after a check of the mesh's size."""
+def _scale(path: Path, mesh: Mesh, unit: str, factor: float) -> float:
+    """Metres per unit of the file times ``factor``, after a check of the mesh's size."""
     if unit and unit not in UNITS_M:
         raise BadInput("--unit", f"one of {', '.join(UNITS_M)}", unit, "name the unit of the file's numbers")
-    longest = float(np.ptp(mesh.vertices, axis=0).max())
+    longest = factor * float(np.ptp(mesh.vertices, axis=0).max())
     longest_m = longest * UNITS_M[unit or "m"]
     if SMALLEST_M <= longest_m <= LARGEST_M:
-        return UNITS_M[unit or "m"]
+        return factor * UNITS_M[unit or "m"]
     likely = [
         f"--unit {name} makes it {longest * factor * 100:.3g} cm"
         for name, factor in UNITS_M.items()

@@ -1,5 +1,6 @@
 """MANO-layout hand as a ``TrackedHand``: 16 joints, 5 tips, 19 capsules, 104 proximity sensors on the palm side."""
 
+from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -58,6 +59,24 @@ def mano_hand(
         hinge_axis=np.zeros((N_ROTATIONS, 3)),
         limit_rad=np.zeros((N_ROTATIONS, 2)),
     )
+
+
+def mano_hands(
+    pair: HandPair, betas: np.ndarray | None = None, templates_m: np.ndarray | None = None
+) -> Mapping[Side, TrackedHand]:
+    """Both hands of a person; betas: (2, 10), zeros by default; templates_m: personal rest meshes (2, 778, 3)."""
+    betas = np.zeros((2, 10), np.float32) if betas is None else betas
+    templates = [None, None] if templates_m is None else [template.tobytes() for template in templates_m]
+    sides: tuple[Side, ...] = ("left", "right")
+    return {side: _cached_hand(pair, side, betas[i].tobytes(), templates[i]) for i, side in enumerate(sides)}
+
+
+@lru_cache(maxsize=64)
+def _cached_hand(pair: HandPair, side: Side, betas: bytes, template: bytes | None) -> TrackedHand:
+    """Cached, because a person's hand is in many clips and takes long to build."""
+    shape = np.frombuffer(betas, np.float32).astype(np.float64)
+    rest = None if template is None else np.frombuffer(template, np.float32).reshape(-1, 3).astype(np.float64)
+    return mano_hand(pair, side, shape, rest)
 
 
 def canonical_axes(model: HandModel) -> np.ndarray:

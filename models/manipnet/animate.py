@@ -8,12 +8,13 @@ import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.errors import BadInput
+from hoidata.geometry.motion import Motion, interpolate_rotations
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands.kinematics import track_rotmats
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
-from models.manipnet.control import Control, Motion, interpolate_rotations
+from models.manipnet.control import Control
 from models.manipnet.plausible import plausible_reading
 from models.manipnet.rollout import Predictor, RolloutTask, roll_out
 from models.manipnet.trajectory_files import MAX_FRAMES, TrajectoryFile
@@ -51,14 +52,28 @@ def control_from_file(file: TrajectoryFile, model: ObjectModel, hands: Mapping[S
     return AnimationInput(accepted.control, accepted.active, notes)
 
 
-def at_30_fps(control: Control) -> Control:
-    """Resample trajectories at 30 fps from their first frame on. Raises BadInput for too many frames."""
+def control_of_two_objects(
+    file: TrajectoryFile, models: Mapping[Side, ObjectModel], hands: Mapping[Side, TrackedHand]
+) -> AnimationInput:
+    """Likewise with an object in each hand."""
+    if len(file.wrists) < len(SIDES):
+        raise BadInput(file.source, "both wrists, with an object in each hand", "one", "add the other one")
+    inputs = {side: control_from_file(file.of(side), models[side], hands) for side in SIDES}
+    wrists: dict[Side, Motion] = {side: inputs[side].control.wrists[side] for side in SIDES}
+    left, right = (replace(one.control, wrists=wrists) for one in inputs.values())
+    return AnimationInput(
+        replace(right, left=left), list(SIDES), [note for one in inputs.values() for note in one.notes]
+    )
+
+
+def at_rate(control: Control, fps: int = FPS) -> Control:
+    """Resample trajectories from their first frame on. Raises BadInput for too many frames."""
     first_s, last_s = control.object_motion.time_s[[0, -1]]
-    n_frames = int(np.floor((last_s - first_s) * FPS + 1e-6)) + 1
+    n_frames = int(np.floor((last_s - first_s) * fps + 1e-6)) + 1
     if n_frames > MAX_FRAMES:
-        expected = f"at most {MAX_FRAMES} frames at {FPS} per second"
+        expected = f"at most {MAX_FRAMES} frames at {fps} per second"
         raise BadInput("time_s", expected, f"{n_frames}", "cut it into pieces")
-    return control.at(first_s + np.arange(n_frames) / FPS)
+    return control.at(first_s + np.arange(n_frames) / fps)
 
 
 class Gap(NamedTuple):
@@ -93,7 +108,7 @@ def predict_fingers(predictor: Predictor, hand: TrackedHand, side: Side, control
     known_frames = int(gap.before is not None)
     start = hand.rest_rotmats if gap.before is None else gap.before
     time_s = control.object_motion.time_s[gap.first - known_frames : gap.stop]
-    (predicted,) = roll_out(predictor, [RolloutTask(hand, side, control, time_s, start)])
+    (predicted,) = roll_out(predictor, [RolloutTask(hand, side, control.of(side), time_s, start)])
     return blend_ends(predicted[known_frames:], gap.before, gap.after, round(SEAM_S * FPS))
 
 
@@ -141,29 +156,31 @@ def with_fingers(track: HandTrack, frames: slice, fingers: np.ndarray, wrist: Mo
     return replace(track, wrist_m=wrist_m, global_orient=global_orient, hand_pose=pose, valid=valid)
 
 
-def clip_of(control: Control, fingers: Mapping[Side, np.ndarray], up: tuple[float, float, float] | None,
-            name: str, synthetic: bool) -> Clip:  # fmt: skip
-    """A clip of trajectories at 30 fps with fingers (frame, 15, 3, 3); a hand without fingers is invalid."""
+def clip_of(control: Control, fingers: Mapping[Side, np.ndarray], templates_m: np.ndarray | None,
+            up: tuple[float, float, float] | None, name: str, synthetic: bool) -> Clip:  # fmt: skip
+    """A clip of trajectories with fingers (frame, 15, 3, 3); a hand without fingers is invalid.
+
+    templates_m: (2, 778, 3) personal rest meshes.
+    """
     n_frames = len(control.object_motion.time_s)
     tracks: dict[Side, HandTrack] = {}
-    for side in SIDES:
+    for index, side in enumerate(SIDES):
         wrist, has_fingers = control.wrists[side].at(control.object_motion.time_s), side in fingers
         hand_pose = rotmat_to_rotvec(fingers[side]).reshape(n_frames, -1) if has_fingers else np.zeros((n_frames, 45))
         wrist_m, orient, hand_pose = (
             array.astype(np.float32) for array in (wrist.translation, rotmat_to_rotvec(wrist.rotation), hand_pose)
         )
-        betas = np.zeros((1, 10), np.float32)
-        tracks[side] = HandTrack(wrist_m, orient, hand_pose, betas=betas, valid=np.full(n_frames, has_fingers))
-    rotvec, hinge_rad = rotmat_to_rotvec(control.object_motion.rotmats).astype(np.float32), control.hinge_rad
-    position_m = control.object_motion.position_m.astype(np.float32)
-    hinge_rad = None if hinge_rad is None else hinge_rad.astype(np.float32)
+        betas, valid = np.zeros((1, 10), np.float32), np.full(n_frames, has_fingers)
+        template_m = None if templates_m is None else templates_m[index]
+        tracks[side] = HandTrack(wrist_m, orient, hand_pose, betas, valid, template_m)
     return Clip(
         clip_id=f"animated/{name}",
         dataset="generated",
         subject="generated",
         sequence=name,
         hands=tracks,
-        object=ObjectTrack(control.model, rotvec, position_m, hinge_rad),
+        object=_object_track(control),
+        other_objects=(_object_track(control.left),) if control.left else (),
         source_frames=np.arange(n_frames, dtype=np.int32),
         gravity=None if up is None else -np.asarray(up),
         gravity_note="" if up else "the file of trajectories does not state which axis is up",
@@ -171,3 +188,9 @@ def clip_of(control: Control, fingers: Mapping[Side, np.ndarray], up: tuple[floa
         object_words=control.model.name.replace("_", " "),
         synthetic=synthetic,
     )
+
+
+def _object_track(control: Control) -> ObjectTrack:
+    rotvec, hinge_rad = rotmat_to_rotvec(control.object_motion.rotmats).astype(np.float32), control.hinge_rad
+    position_m = control.object_motion.position_m.astype(np.float32)
+    return ObjectTrack(control.model, rotvec, position_m, None if hinge_rad is None else hinge_rad.astype(np.float32))

@@ -1,8 +1,7 @@
-"""ManipNet's control signal: the motions of both wrists and of the object, at any frame rate, with interpolation."""
+"""ManipNet's control signal: the motions of both wrists and of the object, at any frame rate."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 
@@ -20,52 +19,26 @@ from hoidata.clips.features import (
     hand_features,
     object_features,
 )
-from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rotvec, rotvec_to_rotmat
-from hoidata.geometry.transform import RigidTransform
-from hoidata.hands import HandPair
-from hoidata.hands.tracked_hand import TrackedHand
+from hoidata.geometry.motion import Motion
+from hoidata.geometry.rotations import rot6d_to_rotmat
 from hoidata.objects.model import ObjectModel
-from hoidata.sensors.mano_hand import mano_hand
 
-_FRAME_TOLERANCE = 1e-6  # of a frame's duration: a time this close to a frame takes its pose without interpolation
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """The motion of one rigid body, world frame."""
-
-    time_s: np.ndarray  # (frame,) increasing
-    rotmats: np.ndarray  # (frame, 3, 3) world_from_body
-    position_m: np.ndarray  # (frame, 3)
-
-    def at(self, time_s: np.ndarray) -> RigidTransform:
-        """Interpolate ``world_from_body`` at times of any shape; constant before the first and after the last frame.
-
-        Rotations are interpolated by slerp, positions linearly. A result depends on its two neighbouring frames only,
-        to the last bit, because a stream discards older frames.
-        """
-        time = np.clip(time_s, self.time_s[0], self.time_s[-1])
-        before = np.searchsorted(self.time_s[1:-1], time, side="right")
-        after = np.minimum(before + 1, len(self.time_s) - 1)
-        since, until = time - self.time_s[before], self.time_s[after] - time
-        frame = np.where(since <= until, before, after)
-        rotation, position_m = self.rotmats[frame], self.position_m[frame]
-        between = np.minimum(since, until) > _FRAME_TOLERANCE * (since + until)
-        start, stop, fraction = before[between], after[between], (since / np.maximum(since + until, 1e-12))[between]
-        rotation[between] = interpolate_rotations(self.rotmats[start], self.rotmats[stop], fraction)
-        start_m = self.position_m[start]
-        position_m[between] = start_m + fraction[:, None] * (self.position_m[stop] - start_m)
-        return RigidTransform(rotation, position_m)
+UNTRACKED_DISTANCE_M = 1.0  # from the object to a wrist that is never tracked: out of range of all sensors
 
 
 @dataclass(frozen=True, eq=False)
 class Control:
-    """The motions of both wrists and of one object."""
+    """The motions of both wrists and of one object, or of an object in each hand."""
 
     wrists: dict[Side, Motion]  # world_from_wrist
     object_motion: Motion  # world_from_object
     model: ObjectModel
     hinge_rad: np.ndarray | None = None  # (frame,) at ``object_motion.time_s``; None for a rigid object
+    left: "Control | None" = None  # with the left hand's object, if it is another one
+
+    def of(self, side: Side) -> "Control":
+        """The control signal with the object of one hand."""
+        return self.left if side == "left" and self.left else self
 
     @cached_property
     def box_middle_m(self) -> np.ndarray:
@@ -87,31 +60,14 @@ class Control:
             return Motion(time_s, pose.rotation, pose.translation)
 
         wrists: dict[Side, Motion] = {side: taken(motion) for side, motion in self.wrists.items()}
-        return Control(wrists, taken(self.object_motion), self.model, self.hinge_at(time_s))
+        left = self.left and self.left.at(time_s)
+        return Control(wrists, taken(self.object_motion), self.model, self.hinge_at(time_s), left)
 
     def hinge_at(self, time_s: np.ndarray) -> np.ndarray | None:
         """Hinge angles at times of any shape, radians; None for a rigid object."""
         if self.hinge_rad is None:
             return None
         return np.interp(time_s, self.object_motion.time_s, self.hinge_rad)
-
-
-UNTRACKED_DISTANCE_M = 1.0  # from the object to a wrist that is never tracked: out of range of all sensors
-
-
-def interpolate_rotations(start: np.ndarray, stop: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-    """Interpolate rotations (frame, ..., 3, 3) by slerp; fraction (frame,): 0 is ``start``, 1 is ``stop``."""
-    rotvec = rotmat_to_rotvec(start.swapaxes(-1, -2) @ stop)
-    return start @ rotvec_to_rotmat(fraction.reshape(-1, *[1] * (rotvec.ndim - 1)) * rotvec)
-
-
-def poses_at(poses: np.ndarray, frame: np.ndarray) -> np.ndarray:
-    """Poses (frame, joint, 3, 3) at fractional frame numbers (time,): the frame's own bits at whole numbers."""
-    before = np.floor(frame + _FRAME_TOLERANCE).astype(int)
-    between = np.flatnonzero(frame - before > _FRAME_TOLERANCE)
-    start, stop, chosen = before[between], np.minimum(before[between] + 1, len(poses) - 1), poses[before]
-    chosen[between] = interpolate_rotations(poses[start], poses[stop], (frame - before)[between])
-    return chosen
 
 
 def control_of(trajectories: Trajectories, model: ObjectModel) -> Control:
@@ -156,17 +112,3 @@ def trajectories_of(sample: ClipSample) -> Trajectories:
 def finger_rotmats_of(hand_features: np.ndarray) -> np.ndarray:
     """Finger rotations (frame, 15, 3, 3) of features (frame, 99)."""
     return rot6d_to_rotmat(hand_features[:, HAND_POSE_6D].astype(np.float64).reshape(-1, N_ROTATIONS - 1, 6))
-
-
-def hands_of(pair: HandPair, betas: np.ndarray, template_m: np.ndarray | None) -> Mapping[Side, TrackedHand]:
-    """Both hands of a person; betas: (2, 10); template_m: personal rest meshes (2, 778, 3) or None."""
-    templates = [None, None] if template_m is None else [template.tobytes() for template in template_m]
-    return {side: _tracked(pair, side, betas[i].tobytes(), templates[i]) for i, side in enumerate(SIDES)}
-
-
-@lru_cache(maxsize=64)
-def _tracked(pair: HandPair, side: Side, betas: bytes, template: bytes | None) -> TrackedHand:
-    """Cached, because a person's hand is in many clips and takes long to build."""
-    shape = np.frombuffer(betas, np.float32).astype(np.float64)
-    rest = None if template is None else np.frombuffer(template, np.float32).reshape(-1, 3).astype(np.float64)
-    return mano_hand(pair, side, shape, rest)

@@ -2,6 +2,7 @@
 
 A frame: ``{"time_s": 1.25, "object": [x, y, z, qw, qx, qy, qz], "left": null, "right": [...], "hinge_rad": 0.3}``, with
 metres, seconds of any clock, and ``hinge_rad`` for a hinged object. A missing body, null or NaN: the tracker lost it.
+With an object in each hand, ``left_object`` is the left hand's.
 ``{"end": true}`` ends the stream. A pose: ``{"time_s": 0.5, "left": [[x, y, z], ...], "right": ...}``, axis-angles.
 """
 
@@ -45,7 +46,7 @@ def parse_address(text: str) -> tuple[str, int]:
     return host, parts.port
 
 
-def parse_frame(data: bytes, is_hinged: bool = False) -> TrackedFrame | None:
+def parse_frame(data: bytes, is_hinged: bool = False, has_left_object: bool = False) -> TrackedFrame | None:
     """Parse any bytes; None: the end of the stream. Raises BadInput, also if a hinged object has no angle."""
     if len(data) > MAX_BYTES:
         raise BadInput("datagram", f"at most {MAX_BYTES} bytes", "more", "send one frame in each")
@@ -65,7 +66,8 @@ def parse_frame(data: bytes, is_hinged: bool = False) -> TrackedFrame | None:
     if is_hinged and body and not np.isfinite(hinge_rad):
         raise BadInput("datagram: hinge_rad", "the angle of the hinged object", "none", "send it")
     wrists: dict[Side, RigidTransform | None] = {side: _pose(values, side) for side in SIDES}
-    return TrackedFrame(time_s, wrists, dict.fromkeys(SIDES, body), dict.fromkeys(SIDES, hinge_rad))
+    left = _pose(values, "left_object") if has_left_object else body
+    return TrackedFrame(time_s, wrists, {"left": left, "right": body}, dict.fromkeys(SIDES, hinge_rad))
 
 
 def _numbers(values: Mapping[str, object], name: str, count: int) -> np.ndarray:
@@ -99,6 +101,7 @@ class Tracker:
     address: tuple[str, int]
     is_hinged: bool  # the object
     report: Callable[[str], None]  # called for the first ``MAX_REPORTS`` refused datagrams
+    has_left_object: bool = False
     received = refused = 0
 
     def frames(self) -> Iterator[TrackedFrame]:
@@ -118,7 +121,7 @@ class Tracker:
                         data = receiver.recv(MAX_BYTES + 1)
                         self.received += 1
                         try:
-                            frame = parse_frame(data, self.is_hinged)
+                            frame = parse_frame(data, self.is_hinged, self.has_left_object)
                         except BadInput as error:
                             self.refused += 1
                             if self.refused <= MAX_REPORTS:

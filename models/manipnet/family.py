@@ -19,10 +19,11 @@ from hoidata.hands import HandPair
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors import sense
+from hoidata.sensors.mano_hand import mano_hands
 from hoidata.settings import build_config
 from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.family import Family, Figures, Skipped, Sources, motion_clip
-from models.manipnet.control import Control, control_of, finger_rotmats_of, hands_of, trajectories_of
+from models.manipnet.control import Control, control_of, finger_rotmats_of, trajectories_of
 from models.manipnet.features import (
     FeatureSettings,
     mirrored_to_right,
@@ -62,7 +63,7 @@ class RecordedHand(NamedTuple):
 
 def recorded_hands(sample: ClipSample, pair: HandPair) -> list[RecordedHand]:
     """The active hands of a clip that are tracked in some frame."""
-    hands = hands_of(pair, sample.betas, sample.template_m)
+    hands = mano_hands(pair, sample.betas, sample.template_m)
     control = control_of(trajectories_of(sample), sample.object_model)
     tracked = [np.flatnonzero(valid) for valid in sample.valid]
     return [
@@ -212,7 +213,7 @@ class FingerSampler:
         trajectories = request.trajectories
         assert trajectories is not None
         control = control_of(trajectories, request.object)
-        fingers = self.fingers(control, hands_of(self.pair, request.betas, request.template_m), request.active_hands)
+        fingers = self.fingers(control, mano_hands(self.pair, request.betas, request.template_m), request.active_hands)
         hands, n_frames = [], len(trajectories.object)
         for side in SIDES:
             wrist, pose_6d = control.wrists[side].at(control.object_motion.time_s), rotmat_to_rot6d(fingers[side])
@@ -233,7 +234,7 @@ class FingerSampler:
 
     def predict_clip(self, sample: ClipSample) -> dict[Side, np.ndarray]:
         """Predict finger rotations for the trajectories of a recorded clip."""
-        hands = hands_of(self.pair, sample.betas, sample.template_m)
+        hands = mano_hands(self.pair, sample.betas, sample.template_m)
         return self.fingers(control_of(trajectories_of(sample), sample.object_model), hands, sample.active_hands)
 
 

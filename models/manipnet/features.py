@@ -11,13 +11,14 @@ from typing import Literal
 import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Side
+from hoidata.geometry.motion import Motion
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import HandState, TrackedHand
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors import OURS, PAPER, SensorSettings, sense
 from hoidata.sensors.sense import CELLS
-from models.manipnet.control import Control, Motion
+from models.manipnet.control import Control
 
 SAMPLE_NUMBERS = 16
 SENSINGS_PER_S = 10

@@ -1,8 +1,8 @@
 """Plausibility check of trajectory files: finds wrong units, wrong quaternion order and wrong wrist axes.
 
-The check uses the hand poses relative to the object, because such a mistake moves or rotates the hands. It accepts 296
-clips (embedded H2O, GRAB and ARCTIC, real ManipNet) in 13 world rotations each, and both demos of ManipNet with six
-objects.
+The check uses the hand poses relative to the object, because such a mistake moves or rotates the hands. Of 296 clips
+(embedded H2O, GRAB and ARCTIC, real ManipNet) in five world rotations each, it refuses 2 of 1,480. With quaternions in
+another order, it accepts 2 of 1,480; with other wrist axes none. It accepts both demos of ManipNet with 14 objects.
 """
 
 from collections.abc import Iterator, Mapping
@@ -10,16 +10,17 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import SIDES, Side
 from hoidata.errors import BadInput
+from hoidata.geometry.motion import Motion
 from hoidata.hands.tracked_hand import TrackedHand
+from hoidata.objects.convex_hull import convex_hull
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.objects.user_mesh import UNITS_M
-from models.manipnet.control import Control, Motion, untracked_wrist
+from models.manipnet.control import Control, untracked_wrist
 from models.manipnet.trajectory_files import TrajectoryFile
 
 NEAR_M = 0.12  # from the palm centre to the object; a hand that never comes this close is not active
@@ -29,21 +30,9 @@ MAX_PALM_DEPTH_M = 0.03  # a palm deeper in the object is implausible
 MIN_WRIST_DISTANCE_M = 0.015  # from the object's hull; recorded wrists are at least 1.9 cm away
 MAX_FRACTION = 0.5  # of a hand's near frames that may violate a limit
 PALM_DIRECTION = np.array([0.8, 0.0, -0.6])  # from the wrist to a grasped object, canonical axes
-PER_PALM_M, PER_SPREAD_M, PER_SPREAD_RAD = 10.0, 5.0, 0.5  # penalty per palm distance and spread of the pose
-MIN_SCORE, MIN_GAIN = -2.0, 0.3  # the best score is 2
-MIN_ALIGNMENT = 0.6
+MIN_ALIGNMENT = 0.6  # of the palm; recorded hands have at least 0.8, with other wrist axes at most 0.3
+MIN_GAIN = 0.02  # of the sum of both hands' alignment, for quaternions in the order x, y, z, w
 MAX_CHECKED_FRAMES = 10_000  # longer files are thinned evenly
-
-
-class Fit(NamedTuple):
-    """How well the poses of a hand fit a grasp of the object."""
-
-    alignment: float  # mean cosine between palm direction and object: 1 towards it, -1 away
-    penalty: float  # for distance and for motion relative to the object
-
-    @property
-    def score(self) -> float:
-        return max(2 * self.alignment - self.penalty, MIN_SCORE)
 
 
 class Reading(NamedTuple):
@@ -51,41 +40,39 @@ class Reading(NamedTuple):
 
     control: Control
     nearest_m: Mapping[Side, float]  # least distance of each palm from the object
-    fits: Mapping[Side, Fit]
+    alignment: Mapping[Side, float]  # mean cosine between palm direction and object: 1 towards it, -1 away
     fault: BadInput | None  # why it is implausible; None if it is plausible
 
     @property
     def active(self) -> list[Side]:
         return [side for side in SIDES if self.nearest_m.get(side, np.inf) < NEAR_M]
 
-    @property
-    def is_good(self) -> bool:
-        """Whether it has no fault and the palm of some near hand faces the object."""
-        return self.fault is None and max(self.fits[side].alignment for side in self.active) > MIN_ALIGNMENT
-
     def gain_over(self, other: "Reading") -> float:
-        """By how much the scores of this reading's near hands exceed those of the other reading."""
-        return sum(self.fits[side].score - other.fits[side].score for side in self.active)
+        """By how much this reading's near hands are aligned better than in the other reading."""
+        return sum(self.alignment[side] - other.alignment[side] for side in self.active)
 
 
 def plausible_reading(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, TrackedHand]) -> Reading:
-    """The file as given. Raises BadInput if it is implausible; the remedy names the change that makes it plausible."""
+    """The file as given. Raises BadInput if it is implausible; the remedy names the probable changes."""
     as_given = reading(file, model, hands)
-    alternatives = [(fault, reading(changed_file, model, hands)) for fault, changed_file in _other_conventions(file)]
-    alternatives = [item for item in alternatives if item[1].is_good]
-    alternatives.sort(key=lambda item: -item[1].gain_over(as_given))
-    if as_given.fault is None:
-        # A plausible file is refused only if an alternative fits clearly better.
-        if alternatives and alternatives[0][1].gain_over(as_given) > MIN_GAIN:
-            raise alternatives[0][0]
+    fault, fits_reordered = as_given.fault, False
+    if not file.is_calibrated:  # else quaternions differ from those of the file
+        reordered = reading(file.with_bodies(_reordered), model, hands)
+        fits_reordered = not reordered.fault and (fault is not None or reordered.gain_over(as_given) > MIN_GAIN)
+    if fault is None and not fits_reordered:
         return as_given
-    plausible_units = [unit for unit, scaled_file in _other_units(file) if reading(scaled_file, model, hands).is_good]
-    if alternatives and not plausible_units:
-        raise alternatives[0][0]
-    remedy = as_given.fault.remedy
-    if plausible_units:
-        remedy = f"perhaps the positions have another unit: --trajectory-unit {' or '.join(plausible_units)}"
-    raise BadInput(file.source, as_given.fault.expected, as_given.fault.got, remedy)
+    units = [unit for unit, scaled in _other_units(file) if fault and not reading(scaled, model, hands).fault]
+    if fault is None or (fits_reordered and not units):
+        got = "hands that fit the object only in the order x, y, z, w"
+        fault = BadInput(file.source, "quaternions in the order w, x, y, z", got, "put w first")
+    remedy = fault.remedy
+    if units:
+        remedy = f"perhaps the positions have another unit: --trajectory-unit {' or '.join(units)}"
+    elif file.is_calibrated:
+        remedy += "; or record the calibration again"
+    elif as_given.fault and file.unit:
+        remedy += "; or the wrists have other axes: name them (--wrist-axes) or measure them (--calibration)"
+    raise BadInput(file.source, fault.expected, fault.got, remedy)
 
 
 def reading(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, TrackedHand]) -> Reading:
@@ -95,8 +82,9 @@ def reading(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, Track
     thinned = control.at(time_s[:: 1 + (len(time_s) - 1) // MAX_CHECKED_FRAMES])
     placed_hands: dict[Side, _PlacedHand] = {side: _PlacedHand(thinned, side, hands[side]) for side in file.wrists}
     nearest: dict[Side, float] = {side: float(placed.palm_distance_m.min()) for side, placed in placed_hands.items()}
-    fits: dict[Side, Fit] = {side: placed.fit() for side, placed in placed_hands.items()}
-    return Reading(control, nearest, fits, _far(file, nearest) or _inside(file, placed_hands))
+    alignment: dict[Side, float] = {side: placed.alignment() for side, placed in placed_hands.items()}
+    fault = _far(file, nearest) or _inside(file, placed_hands) or _turned_away(file, alignment, nearest)
+    return Reading(control, nearest, alignment, fault)
 
 
 def _control(file: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, TrackedHand]) -> Control:
@@ -142,24 +130,17 @@ class _PlacedHand:
     def fraction_of_near(self, frames: np.ndarray) -> float:
         return float((frames & self.is_near).sum() / max(self.is_near.sum(), 1))
 
-    def fit(self) -> Fit:
-        """Score the frames in which the hand can reach the object.
+    def alignment(self) -> float:
+        """Mean cosine of the palm direction with the object, in the frames in which the hand can reach it.
 
-        Alignment is measured with the object's centre and with its surface point nearest to the palm.
+        The mean of those with the object's centre and with its surface point nearest to the palm; -1 without a frame.
         """
         reachable = self.distance_m(self.control.model) < REACH_M
         if not reachable.any():
-            return Fit(MIN_SCORE / 2, 0.0)
+            return -1.0
         palm_directions = self.object_from_wrist[reachable] @ (self.hand.wrist_from_canonical @ PALM_DIRECTION)
-        wrist_m, rotations = self.wrist_m[reachable], Rotation.from_matrix(self.object_from_wrist[reachable])
-        middle_m = self.control.model.vertices_m.mean(axis=0)
-        targets_m = middle_m, self.closest_m[reachable]
-        cosines = [_mean_cosine(palm_directions, target_m - wrist_m) for target_m in targets_m]
-        position_spread_m = float(np.linalg.norm(wrist_m.std(axis=0)))
-        rotation_spread_rad = float(np.sqrt(((rotations.mean().inv() * rotations).magnitude() ** 2).mean()))
-        distance_m = max(float(np.median(self.palm_distance_m[reachable])), 0.0)
-        penalty = PER_PALM_M * distance_m + PER_SPREAD_M * position_spread_m + PER_SPREAD_RAD * rotation_spread_rad
-        return Fit(sum(cosines) / 2, penalty)
+        targets_m = self.control.model.vertices_m.mean(axis=0), self.closest_m[reachable]
+        return sum(_mean_cosine(palm_directions, target_m - self.wrist_m[reachable]) for target_m in targets_m) / 2
 
 
 def _mean_cosine(directions: np.ndarray, vectors: np.ndarray) -> float:
@@ -176,6 +157,17 @@ def _far(file: TrajectoryFile, nearest_m: Mapping[Side, float]) -> BadInput | No
     return BadInput(file.source, expected, got, "check the positions and their unit")
 
 
+def _turned_away(
+    file: TrajectoryFile, alignments: Mapping[Side, float], nearest_m: Mapping[Side, float]
+) -> BadInput | None:
+    """The fault of near palms of which none faces the object."""
+    alignment = max(alignment for side, alignment in alignments.items() if nearest_m[side] < NEAR_M)
+    if alignment > MIN_ALIGNMENT:
+        return None
+    expected = f"a palm that faces the object, with a cosine above {MIN_ALIGNMENT}"
+    return BadInput(file.source, expected, f"at most {alignment:.2g}", "check the origin and axes of the mesh")
+
+
 def _inside(file: TrajectoryFile, placed_hands: Mapping[Side, _PlacedHand]) -> BadInput | None:
     """The fault of a palm deep in the object, or a wrist in its convex hull, in most near frames."""
     for side, placed in placed_hands.items():
@@ -184,45 +176,12 @@ def _inside(file: TrajectoryFile, placed_hands: Mapping[Side, _PlacedHand]) -> B
             got = f"a {side} palm inside it in {100 * fraction:.0f} % of the frames in which it is near"
             remedy = "perhaps the mesh has another unit (--unit cm), or another origin than in the trajectories"
             return BadInput(file.source, f"{name} outside of the hands", got, remedy)
-        buried = placed.distance_m(_hull(placed.control.model)) < MIN_WRIST_DISTANCE_M
+        buried = placed.distance_m(convex_hull(placed.control.model)) < MIN_WRIST_DISTANCE_M
         if (fraction := placed.fraction_of_near(buried)) > MAX_FRACTION:
             got = f"a {side} wrist in it or closer in {100 * fraction:.0f} % of the frames in which the palm is near"
             remedy = "check the unit of the positions (--trajectory-unit) and of the mesh (--unit)"
             return BadInput(file.source, f"a wrist at least {100 * MIN_WRIST_DISTANCE_M} cm off {name}", got, remedy)
     return None
-
-
-def _hull(model: ObjectModel) -> ObjectModel:
-    """Replace each part by its convex hull, which fills hollow objects; a flat part is unchanged."""
-    faces = [_hull_faces(model, part) for part in model.parts]
-    return replace(model, faces=np.concatenate(faces))
-
-
-def _hull_faces(model: ObjectModel, part: int) -> np.ndarray:
-    """(face, 3) vertex indices of a part's convex hull, oriented outward."""
-    part_faces = model.faces_of(part)
-    vertex_ids = np.unique(part_faces)
-    try:
-        hull = ConvexHull(model.vertices_m[vertex_ids])
-    except QhullError:
-        return part_faces
-    corners = model.vertices_m[vertex_ids][hull.simplices]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inward = (normal * hull.equations[:, :3]).sum(axis=1) < 0
-    simplices = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices)
-    return vertex_ids[simplices].astype(part_faces.dtype)
-
-
-def _other_conventions(file: TrajectoryFile) -> Iterator[tuple[BadInput, TrajectoryFile]]:
-    """The file with other wrist axes and with quaternions in the order x, y, z, w, each with the fault to report."""
-    if file.unit:
-        other = "model" if file.axes == "canonical" else "canonical"
-        got = f"hands that fit the object only in the axes of --wrist-axes {other}"
-        fault = BadInput(file.source, f"wrists in the axes of --wrist-axes {file.axes}", got, f"--wrist-axes {other}")
-        yield fault, replace(file, axes=other)
-    got = "hands that fit the object only in the order x, y, z, w"
-    fault = BadInput(file.source, "quaternions in the order w, x, y, z", got, "put w first")
-    yield fault, file.with_bodies(_reordered)
 
 
 def _reordered(body: Motion) -> Motion:

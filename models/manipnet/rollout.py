@@ -16,12 +16,13 @@ import numpy as np
 import torch
 
 from hoidata.clips.clip import Side
+from hoidata.geometry.motion import interpolate_rotations, poses_at
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import HandState, TrackedHand
 from hoidata.objects.distance import SignedDistance
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
 from hoidata.sensors import sense
-from models.manipnet.control import Control, interpolate_rotations, poses_at
+from models.manipnet.control import Control
 from models.manipnet.features import (
     FeatureSettings,
     distance_offset_m,

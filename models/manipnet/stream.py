@@ -17,11 +17,12 @@ from typing import NamedTuple, TypeGuard
 import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Side
+from hoidata.geometry.motion import Motion, interpolate_rotations
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
-from models.manipnet.control import Control, Motion, interpolate_rotations, untracked_wrist
+from models.manipnet.control import Control, untracked_wrist
 from models.manipnet.features import object_from_wrist
 from models.manipnet.rollout import FrameContext, HandRollout, Predictor, frame_context
 
@@ -48,11 +49,13 @@ def tracked_frames(control: Control) -> Iterator[TrackedFrame]:
     """The frames of recorded trajectories, as a tracker delivers them."""
     time_s = control.object_motion.time_s
     wrist_poses: dict[Side, RigidTransform] = {side: control.wrists[side].at(time_s) for side in SIDES}
-    object_poses, hinge_rad = control.object_motion.at(time_s), control.hinge_at(time_s)
+    object_poses: dict[Side, RigidTransform] = {side: control.of(side).object_motion.at(time_s) for side in SIDES}
+    hinge_rad = control.hinge_at(time_s)
     for frame, frame_s in enumerate(time_s.tolist()):
         wrists: dict[Side, RigidTransform | None] = {side: poses[frame] for side, poses in wrist_poses.items()}
         angles = None if hinge_rad is None else dict.fromkeys(SIDES, float(hinge_rad[frame]))
-        yield TrackedFrame(frame_s, wrists, dict.fromkeys(SIDES, object_poses[frame]), angles)
+        objects: dict[Side, RigidTransform | None] = {side: poses[frame] for side, poses in object_poses.items()}
+        yield TrackedFrame(frame_s, wrists, objects, angles)
 
 
 class Sample(NamedTuple):
@@ -114,16 +117,18 @@ def motion_of(samples: Trajectory) -> Motion:
     return Motion(np.array([sample.time_s for sample in samples]), rotmats, position_m)
 
 
-def control_of_frames(frames: Sequence[TrackedFrame], model: ObjectModel) -> tuple[Control | None, np.ndarray]:
-    """Trajectories at 30 fps of a tracker's frames with one object, interpolated where a body is lost; None without it.
+def control_of_frames(
+    frames: Sequence[TrackedFrame], model: ObjectModel, hand: Side = "right"
+) -> tuple[Control | None, np.ndarray]:
+    """Trajectories at 30 fps of a tracker's frames with a hand's object, interpolated in gaps; None without it.
 
     Also (2, frame) whether each wrist is tracked, or lost for at most ``MAX_GAP_S``.
     """
     bodies: list[list[Sample]] = [[], [], []]  # wrists and object
     for one in frames:
-        for samples, pose in zip(bodies, (*map(one.wrists.get, SIDES), one.objects.get("right")), strict=True):
+        for samples, pose in zip(bodies, (*map(one.wrists.get, SIDES), one.objects.get(hand)), strict=True):
             if is_usable(pose):
-                samples.append(Sample(one.time_s, pose, (one.hinge_rad or {}).get("right", 0.0)))
+                samples.append(Sample(one.time_s, pose, (one.hinge_rad or {}).get(hand, 0.0)))
     if not bodies[2]:
         return None, np.zeros((2, 0), bool)
     first_s, body, valid = frames[0].time_s, motion_of(bodies[2]), []

@@ -16,20 +16,14 @@ from hoidata.batches.dataset import ClipBatch, ClipSample
 from hoidata.clips.clip import FPS, SIDES, Side
 from hoidata.devices import send
 from hoidata.errors import BadInput
+from hoidata.geometry.motion import interpolate_rotations, poses_at
 from hoidata.hands import HandPair
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors import sensor_size
+from hoidata.sensors.mano_hand import mano_hands
 from models.common.family import Losses, Network, Setup
-from models.manipnet.control import (
-    Control,
-    control_of,
-    finger_rotmats_of,
-    hands_of,
-    interpolate_rotations,
-    poses_at,
-    trajectories_of,
-)
+from models.manipnet.control import Control, control_of, finger_rotmats_of, trajectories_of
 from models.manipnet.features import FeatureSettings, hand_inputs, mirrored_to_right, outputs, sizes, std_floors
 from models.manipnet.inverse_kinematics import rotvecs_from_rest
 from models.manipnet.network import ManipNet, NetworkConfig
@@ -125,7 +119,7 @@ def clip_examples(
 
     pool: (pose, 15, 3, 3) as a right hand's; None: recorded poses.
     """
-    hands = hands_of(pair, sample.betas, sample.template_m)
+    hands = mano_hands(pair, sample.betas, sample.template_m)
     control = control_of(trajectories_of(sample), sample.object_model)
     clip_frame = np.arange(int((sample.length - 1) / (FPS * settings.step_s) + 1e-6) + 1) * settings.step_s * FPS
     frames = np.floor(clip_frame + 1e-6).astype(int), np.ceil(clip_frame - 1e-6).astype(int)
@@ -149,9 +143,9 @@ def has_steps(sample: ClipSample) -> np.ndarray:
 
 def pose_pool(samples: Sequence[ClipSample], pair: HandPair) -> np.ndarray:
     """(pose, 15, 3, 3) the neutral pose and the finger rotations of all tracked active hands, as a right hand's."""
-    poses = [hands_of(pair, samples[0].betas, samples[0].template_m)["right"].rest_rotmats[None]]
+    poses = [mano_hands(pair, samples[0].betas, samples[0].template_m)["right"].rest_rotmats[None]]
     for sample in samples:
-        hands = hands_of(pair, sample.betas, sample.template_m)
+        hands = mano_hands(pair, sample.betas, sample.template_m)
         for side_index in np.flatnonzero(sample.active_hands):
             fingers = finger_rotmats_of(sample.hands[side_index, sample.valid[side_index]])
             poses.append(mirrored_to_right(hands[SIDES[side_index]], fingers))
@@ -173,7 +167,7 @@ class FingersObjective:
             sample.clip_id: list(zip(*(clip_examples(sample, pair, settings, pool) for pool in pools), strict=True))
             for sample in clips
         }
-        hand = hands_of(pair, clips[0].betas, clips[0].template_m)["right"]
+        hand = mano_hands(pair, clips[0].betas, clips[0].template_m)["right"]
         examples = [example for clip in self.examples.values() for kinds in clip for example in kinds]
         self.network = build_network(setup.network, hand, examples).to(setup.device)
         validation = [example for sample in setup.corpus.held_out for example in clip_examples(sample, pair, settings)]

@@ -2,7 +2,9 @@
 
 CSV: a header, then one line per frame, columns in any order: ``time_s``, and for each of ``object``, ``left`` and
 ``right`` (one hand may be missing) the seven ``<body>_x _y _z _qw _qx _qy _qz``; ``hinge_rad`` for a hinged object.
+With an object in each hand, ``left_object`` is the left hand's, and ``object`` the right hand's.
 NPZ: ``time_s (frame,)``, ``<body>_position (frame, 3)``, ``<body>_quaternion (frame, 4)`` with w first, ``hinge_rad``.
+A body is lost in frames with an empty cell or NaN; gaps of up to ``MAX_STEP_S`` are interpolated.
 Positions are in metres or the given unit, in a right-handed world. The object's pose is that of its mesh file's frame.
 A wrist's pose has the axes of the hand model's wrist joint ("model"), or "canonical" axes: x to the fingers, y to the
 thumb and z out of the back of a right hand; a left hand is the mirror image with x away from the fingers.
@@ -25,11 +27,11 @@ from scipy.spatial.transform import Rotation
 from hoidata.clips.clip import SIDES, Side
 from hoidata.errors import BadInput
 from hoidata.files.numpy_files import load_npz_arrays
+from hoidata.geometry.motion import Motion
 from hoidata.objects.user_mesh import UNITS_M
-from models.manipnet.control import Motion
 
 Axes = Literal["model", "canonical"]
-BODIES = ("object", *SIDES)
+BODIES = ("object", *SIDES, "left_object")
 PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 ENDINGS = (".csv", ".npz", ".txt")
 MAX_RATE_HZ, MIN_RATE_HZ = 1000.0, 5.0
@@ -48,7 +50,9 @@ class TrajectoryFile:
     wrists: Mapping[Side, Motion]  # one or both
     object_body: Motion
     hinge_rad: np.ndarray | None = None  # (frame,)
+    left_object: Motion | None = None  # if the left hand has another object than ``object_body``
     axes: Axes = "model"  # of the wrists
+    is_calibrated: bool = False  # whether a calibration has changed the wrists
     at_box: bool = False  # whether the object's position is the centre of its bounding box
     up: tuple[float, float, float] | None = None  # of the world; None if the format does not define it
     mesh_unit: str = ""  # of the meshes that belong to this format
@@ -57,6 +61,13 @@ class TrajectoryFile:
     def with_bodies(self, change: Callable[[Motion], Motion]) -> "TrajectoryFile":
         wrists: dict[Side, Motion] = {side: change(body) for side, body in self.wrists.items()}
         return replace(self, wrists=wrists, object_body=change(self.object_body))
+
+    def of(self, side: Side) -> "TrajectoryFile":
+        """One hand of a file with two objects, with its object."""
+        wrists: dict[Side, Motion] = {side: self.wrists[side]}
+        if side == "right" or self.left_object is None:
+            return replace(self, wrists=wrists, left_object=None)
+        return replace(self, wrists=wrists, object_body=self.left_object, hinge_rad=None, left_object=None)
 
 
 def read_trajectories(path: Path, unit: str = "", axes: Axes = "model") -> TrajectoryFile:
@@ -126,12 +137,23 @@ def from_arrays(arrays: Mapping[str, np.ndarray], source: str, unit: str = "m") 
     time_s = _array(arrays, "time_s", (), source)
     _check_times(time_s, source)
     sides: list[Side] = [side for side in SIDES if f"{side}_position" in arrays]
-    wrists: dict[Side, Motion] = {side: _body(arrays, side, time_s, source, UNITS_M[unit]) for side in sides}
+    bodies: dict[Side, Motion] = {side: _body(arrays, side, time_s, source, UNITS_M[unit]) for side in sides}
+    wrists: dict[Side, Motion] = {side: body for side, body in bodies.items() if len(body.time_s)}
     if not wrists:
         raise BadInput(source, "the wrist of a hand, left or right", "neither", "add left_... or right_...")
-    object_body = _body(arrays, "object", time_s, source, UNITS_M[unit])
-    hinge = _array(arrays, "hinge_rad", (), source, len(time_s)) if "hinge_rad" in arrays else None
-    return TrajectoryFile(source=source, wrists=wrists, object_body=object_body, hinge_rad=hinge, unit=unit)
+    object_body, hinge = _body(arrays, "object", time_s, source, UNITS_M[unit]), None
+    if "hinge_rad" in arrays:
+        angles = _array(arrays, "hinge_rad", (), source, len(time_s), may_be_lost=True)
+        hinge = _array({"hinge_rad": angles[np.isin(time_s, object_body.time_s)]}, "hinge_rad", (), source)
+    objects = {"object": object_body}
+    if "left_object_position" in arrays:
+        objects["left_object"] = _body(arrays, "left_object", time_s, source, UNITS_M[unit])
+    for name, body in {**wrists, **objects}.items():
+        gap_s = np.diff(np.r_[time_s[0], body.time_s, time_s[-1]]).max()
+        if gap_s > MAX_STEP_S or not len(body.time_s):
+            expected, got = f"gaps of at most {MAX_STEP_S:g} s", f"{name} lost for {gap_s:.2f} s"
+            raise BadInput(source, expected, got, "cut the file there")
+    return TrajectoryFile(source, wrists, object_body, hinge, objects.get("left_object"), unit=unit)
 
 
 def parse_manipnet(data: bytes, source: str) -> TrajectoryFile:
@@ -144,7 +166,7 @@ def parse_manipnet(data: bytes, source: str) -> TrajectoryFile:
         raise BadInput(source, "a frame rate in the first line", f"{lines[0][:40] if lines else 'nothing'}", remedy)
     table = _numbers([line.split(",") for line in lines[1:]], 21, source)
     arrays = {"time_s": np.arange(len(table)) / rate}
-    for number, body in enumerate(BODIES):
+    for number, body in enumerate(BODIES[:3]):
         columns = table[:, 7 * number : 7 * number + 7]
         arrays[f"{body}_quaternion"] = columns[:, [3, 0, 1, 2]] * _MIRROR_QUATERNION
         arrays[f"{body}_position"] = columns[:, 4:] * _MIRROR_POSITION
@@ -153,31 +175,34 @@ def parse_manipnet(data: bytes, source: str) -> TrajectoryFile:
 
 
 def _numbers(rows: list[list[str]], count: int, source: str) -> np.ndarray:
-    """(row, count) finite numbers."""
+    """(row, count) numbers; NaN for an empty cell."""
     if len(rows) > MAX_FRAMES:
         raise BadInput(source, f"at most {MAX_FRAMES} frames", f"{len(rows)}", "cut it into pieces")
     for number, cells in enumerate(rows):
         if len(cells) != count:
             raise BadInput(f"{source}: row {number + 1}", f"{count} numbers", f"{len(cells)}", "correct the row")
     try:
-        table = np.array([[float(word) for word in cells] for cells in rows], np.float64).reshape(len(rows), count)
+        table = [[float(word) if word.strip() else np.nan for word in cells] for cells in rows]
     except ValueError as error:
         raise BadInput(source, "numbers", str(error)[:200], "correct the file") from error
-    if not (is_finite := np.abs(table) < MAX_ABS_VALUE).all():
-        cells = int(np.flatnonzero(~is_finite.all(axis=1))[0])
-        raise BadInput(f"{source}: row {cells + 1}", "finite numbers", "NaN or infinity", "cut the file there")
-    return table
+    return np.array(table, np.float64).reshape(len(rows), count)
 
 
 def _array(
-    arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...], source: str, count: int | None = None
+    arrays: Mapping[str, np.ndarray],
+    name: str,
+    shape: tuple[int, ...],
+    source: str,
+    count: int | None = None,
+    may_be_lost: bool = False,
 ) -> np.ndarray:
-    """(frame, *shape) finite float64."""
+    """(frame, *shape) finite float64, or NaN in frames in which a body is lost."""
     if name not in arrays:
         raise BadInput(source, f"an array {name}", "none", "add it")
     array = np.asarray(arrays[name])
     fits = array.ndim == 1 + len(shape) and array.shape[1:] == shape and len(array) == (count or len(array))
-    if not fits or array.dtype.kind not in "fiu" or not (np.abs(array) < MAX_ABS_VALUE).all():
+    is_number = array.dtype.kind in "fiu"
+    if not fits or not is_number or not ((np.abs(array) < MAX_ABS_VALUE) | (may_be_lost & np.isnan(array))).all():
         expected = f"finite numbers of shape ({count or 'frame'}, {', '.join(map(str, shape))})"
         raise BadInput(f"{source}: {name}", expected, f"{array.dtype} {array.shape}", "correct it")
     return array.astype(np.float64)
@@ -205,11 +230,17 @@ def _check_times(time_s: np.ndarray, source: str) -> None:
 
 
 def _body(arrays: Mapping[str, np.ndarray], body: str, time_s: np.ndarray, source: str, unit_m: float) -> Motion:
-    position = _array(arrays, f"{body}_position", (3,), source, len(time_s))
-    quaternion = _array(arrays, f"{body}_quaternion", (4,), source, len(time_s))
+    """The motion of a body in the frames in which it is tracked."""
+    position, quaternion = (
+        _array(arrays, f"{body}_{name}", (count,), source, len(time_s), may_be_lost=True)
+        for name, count in (("position", 3), ("quaternion", 4))
+    )
+    is_lost = np.isnan(np.c_[position, quaternion]).any(axis=1)
+    quaternion[is_lost] = [1.0, 0.0, 0.0, 0.0]
     length = np.linalg.norm(quaternion, axis=1)
     if np.abs(length - 1).max() > 0.01:
         row_number = int(np.abs(length - 1).argmax())
         got = f"one of length {length[row_number]:.3g} in row {row_number + 1}"
         raise BadInput(f"{source}: {body}", "quaternions of length 1", got, "write w, x, y, z of a rotation")
-    return Motion(time_s, Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_matrix(), position * unit_m)
+    rotmats = Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_matrix()
+    return Motion(time_s[~is_lost], rotmats[~is_lost], position[~is_lost] * unit_m)

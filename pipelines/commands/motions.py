@@ -31,6 +31,15 @@ MeshHinge = Annotated[
     typer.Option(help="Hinge of a mesh of two pieces, 'px,py,pz dx,dy,dz': point and direction; a slide: direction."),
 ]
 Moving = Annotated[str, typer.Option(help="What moves: joint of a URDF, or pieces of a mesh with --hinge.")]
+LeftObject = Annotated[str, typer.Option(help="Another rigid object in the left hand (docs/fingers.md).")]
+HandLength = Annotated[
+    float | None,
+    typer.Option(help="Own hand's length in cm, wrist joint to middle fingertip. Default: the mean.", min=12, max=26),
+]
+Calibration = Annotated[
+    str, typer.Option(help="A recording of flat hands that calibrates trackers to the wrists (docs/fingers.md).")
+]
+Scale = Annotated[float, typer.Option(help="Factor on the size of a mesh file.", min=0.1, max=10)]
 Profile = Annotated[str, typer.Option(help="Profile: embedded, study or own. Default: the one in params.yaml.")]
 MESH = "A mesh file (OBJ, PLY, STL, GLB), a URDF or its folder, or a dataset's object."
 Object = Annotated[str, typer.Option("--object", help=MESH)]
@@ -119,6 +128,7 @@ def generate(
     up: Up = "",
     hinge: MeshHinge = "",
     moving: Moving = "",
+    scale: Scale = 1.0,
     hand_by: HandBy = None,
     profile: Profile = "",
     encoder: Encoder = "",
@@ -128,10 +138,11 @@ def generate(
     from hoidata.objects.user_mesh import is_object_path
 
     mesh = Path(object).resolve() if is_object_path(object) else None
+    of_mesh = {"--unit": unit, "--up": up, "--hinge": hinge, "--moving": moving, "--scale": scale != 1}
     _refuse_ineffective(
         {"--model": models and model, "--profile": models and profile, "--encoder": not models and encoder}
         | {"--hand-by": hand and hand_by}
-        | ({} if mesh or Path(object).suffix else {"--unit": unit, "--up": up, "--hinge": hinge, "--moving": moving})
+        | ({} if mesh or Path(object).suffix else of_mesh)
     )
     project = ("", ()) if models else _project(profile)
     from hoidata.clips.clip import FPS
@@ -152,7 +163,7 @@ def generate(
         model=model,
         models=_models_in(models, encoder) if models else None,
         options=MotionOptions(seed=seed, samples=samples, hand=hand, frames=frames, hand_by=hand_by),
-        mesh=MeshOptions(unit, up, hinge, moving),
+        mesh=MeshOptions(unit, up, hinge, moving, scale),
         sampler=of_sampler,
         sampling=of_sampling,
         force=force,
@@ -167,7 +178,7 @@ def _refuse_ineffective(options: Mapping[str, Any]) -> None:
 
         expected = (
             "--model and --profile in a project, --encoder with --models, --hand-by without --hand, --unit, --up, "
-            "--hinge and --moving with an existing mesh file"
+            "--hinge, --moving and --scale with an existing mesh file"
         )
         raise BadInput(", ".join(ineffective), expected, "an option that has no effect here", "omit it")
 
@@ -215,20 +226,27 @@ def animate(
             help="Wrist axes in .csv and .npz files: the hand model's, or canonical (x to the fingers, y to the thumb)."
         ),
     ] = "model",
+    left_object: LeftObject = "",
+    calibration: Calibration = "",
+    hand_length: HandLength = None,
     world_up: WorldUp = "",
     unit: MeshUnit = "",
     hinge: MeshHinge = "",
     moving: Moving = "",
+    scale: Scale = 1.0,
     way: Annotated[
         Literal["auto", "network", "interpolate"],
         typer.Option(
             help="How to fill frames of a clip. auto: interpolate gaps up to 2 s between known poses, else network."
         ),
     ] = "auto",
+    fps: Annotated[
+        Literal["30", "60", "120"], typer.Option(help="Frames per second of motion.npz; other files have 30.")
+    ] = "30",
     profile: Profile = "",
 ) -> None:
     """Generate finger motion for given wrist and object trajectories; write arrays, an animated GLB and a web page."""
-    source, object = map(_absolute, (source, object))
+    source, object, left_object, calibration = map(_absolute, (source, object, left_object, calibration))
     project = _project(profile)
     from hoidata.clips.clip import SIDES
     from pipelines.animation import AnimationOptions, animate_files
@@ -240,10 +258,14 @@ def animate(
         model=model,
         rule=rule,
         object=object,
+        left_object=left_object,
         unit=trajectory_unit,
         axes=wrist_axes,
         up=world_up,
-        mesh=MeshOptions(unit, "", hinge, moving),
+        calibration=calibration,
+        hand_length_cm=hand_length,
+        mesh=MeshOptions(unit, "", hinge, moving, scale),
+        fps=int(fps),
         method=way,
     )
     _print_written(animate_files(source, options, *project, out, store))
@@ -261,16 +283,20 @@ def stream(
     fast: Annotated[bool, typer.Option("--fast", help="Do not wait for the times of a file.")] = False,
     fingers: Fingers = "both",
     model: Annotated[str, typer.Option(help="Dataset whose network to use. Default: the first with a network.")] = "",
+    left_object: LeftObject = "",
+    calibration: Calibration = "",
+    hand_length: HandLength = None,
     world_up: WorldUp = "",
     unit: MeshUnit = "",
     hinge: MeshHinge = "",
     moving: Moving = "",
+    scale: Scale = 1.0,
 ) -> None:
     """Stream fingers live for a file, at its recorded speed, or for a tracker.
 
     Prints a pose per line: time_s, axis-angles (15, 3) of each hand. Then writes what `animate` does.
     """
-    object = _absolute(object)
+    object, left_object, calibration = map(_absolute, (object, left_object, calibration))
     source = source if "://" in source else str(Path(source).absolute())
     project = _project("")
     from hoidata.clips.clip import SIDES
@@ -281,8 +307,11 @@ def stream(
         sides=SIDES if fingers == "both" else (fingers,),
         model=model,
         object=object,
+        left_object=left_object,
         up=world_up,
-        mesh=MeshOptions(unit, "", hinge, moving),
+        calibration=calibration,
+        hand_length_cm=hand_length,
+        mesh=MeshOptions(unit, "", hinge, moving, scale),
     )
 
     report = partial(typer.echo, err=True)
@@ -310,6 +339,7 @@ def hands(
     up: Up = "",
     hinge: MeshHinge = "",
     moving: Moving = "",
+    scale: Scale = 1.0,
     hinge_range: Annotated[
         str,
         typer.Option(
@@ -332,7 +362,7 @@ def hands(
         keyframes=keyframes,
         clip=clip,
         motion=motion,
-        mesh=MeshOptions(unit, up, hinge, moving),
+        mesh=MeshOptions(unit, up, hinge, moving, scale),
         hinge_range=hinge_range,
         hand=hand,
         samples=samples,

@@ -12,7 +12,8 @@ from hoidata.clips.clip import SIDES, Side
 from hoidata.clips.recording import HandRecording
 from hoidata.datasets import RawTree, SequenceKey
 from hoidata.datasets.manipnet.adapter import HAND_JOINTS
-from models.manipnet.control import Control, Motion
+from hoidata.geometry.motion import Motion
+from models.manipnet.control import Control
 
 # A right hand in the files' axes: fingers to -x, thumb side +y, palm to -z. "~" is "-" on the right, "" on the left.
 HAND = """HIERARCHY

@@ -138,6 +138,13 @@ def test_the_asset_is_small_and_has_its_provenance():
     assert "CC0" in provenance
 
 
+def test_a_scaled_hand_has_the_length_from_the_wrist_joint_to_the_middle_fingertip(pair):
+    for model, template_m in zip((pair.left, pair.right), pair.templates_of_length(0.2), strict=True):
+        wrist_m = model.rest_joints_m(np.zeros(10), template_m)[0]
+        assert np.linalg.norm(template_m[TIP_VERTICES[1]] - wrist_m) == pytest.approx(0.2, abs=1e-6)
+        assert np.ptp(template_m / model.template_m) < 1e-5
+
+
 def test_the_digest_depends_on_content_and_side(pair):
     assert pair.left.digest != pair.right.digest
     assert load_embedded_hands().digest == pair.digest

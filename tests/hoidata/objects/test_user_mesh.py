@@ -76,6 +76,15 @@ def test_a_given_unit_is_used(tmp_path):
         read_user_object(tmp_path / "mug.stl", unit="feet")
 
 
+def test_a_factor_scales_the_mesh_about_its_origin_and_the_size_is_checked_after_it(tmp_path):
+    path = saved(MUG, tmp_path / "mug.obj")
+    plain, scaled = (read_user_object(path, factor=factor).model for factor in (1.0, 1.5))
+    np.testing.assert_allclose(scaled.vertices_m, 1.5 * plain.vertices_m)
+    np.testing.assert_allclose(plain.scaled(1.5).vertices_m, scaled.vertices_m)
+    with pytest.raises(BadInput, match=r"a longest side of 0.005 to 2 m, got 3 m"):
+        read_user_object(path, factor=30)
+
+
 def test_the_second_of_two_pieces_rotates_about_the_hinge(tmp_path):
     base, lid = trimesh.creation.box((200, 150, 40)), trimesh.creation.box((200, 150, 20))
     lid.apply_translation([0, 0, 31])

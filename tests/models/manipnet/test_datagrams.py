@@ -37,6 +37,20 @@ def test_a_datagram_is_a_frame_with_metres_and_w_first() -> None:
         np.testing.assert_array_equal(pose.translation, POSE[:3])
 
 
+def test_the_left_hands_own_object_is_lost_if_it_is_missing() -> None:
+    lost, frame = (
+        parse_frame(datagram(), has_left_object=True),
+        parse_frame(datagram(left_object=[0, 0, 2, *POSE[3:]]), False, True),
+    )
+    assert lost is not None
+    assert (lost.objects["left"], lost.objects["right"] is None) == (None, False)
+    assert frame is not None
+    assert frame.objects["left"] is not None
+    assert frame.objects["left"].translation[2] == 2
+    assert frame.objects["right"] is not None
+    np.testing.assert_array_equal(frame.objects["right"].translation, POSE[:3])
+
+
 @pytest.mark.parametrize("lost", [None, [nan] * 7, [inf, *POSE[1:]], [*POSE[:6], nan]])
 def test_null_and_numbers_that_are_not_finite_are_a_lost_body(lost: object) -> None:
     frame = parse_frame(datagram(object=lost))

@@ -7,10 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import Side
+from hoidata.geometry.motion import Motion
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.sensors.mano_hand import mano_hand
-from models.manipnet.control import Control, Motion
+from models.manipnet.control import Control
 from models.manipnet.features import (
     FeatureSettings,
     hand_inputs,

@@ -18,14 +18,14 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.distance import SignedDistance
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
-from hoidata.sensors.mano_hand import mano_hand
+from hoidata.sensors.mano_hand import mano_hand, mano_hands
 from hoidata.store.annotated import AnnotatedStore
 from models.common.checkpoints import load_checkpoint
 from models.common.family import Skipped, Sources
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.training import train_network
 from models.manipnet.animate import Gap, predict_fingers
-from models.manipnet.control import control_of, finger_rotmats_of, hands_of, trajectories_of
+from models.manipnet.control import control_of, finger_rotmats_of, trajectories_of
 from models.manipnet.family import FingerSampler, diagnose, recorded_hands, thinned
 from models.manipnet.features import FeatureSettings, mirrored_to_right, outputs, pose_features
 from models.manipnet.inverse_kinematics import Limits, reach
@@ -134,7 +134,7 @@ def test_a_stream_equals_the_rollout_of_the_clip_bit_for_bit(
     fingers: FingerSampler, samples: list[ClipSample], rule
 ) -> None:
     sample, predictor = samples[0], replace(fingers.predictor, rule=rule)
-    control, hands = control_of(trajectories_of(sample), sample.object_model), hands_of(HANDS, sample.betas, None)
+    control, hands = control_of(trajectories_of(sample), sample.object_model), mano_hands(HANDS, sample.betas, None)
     start = {side: perturbed_pose(hands[side], 0.1)[0] for side in SIDES}
     time_s = control.object_motion.time_s
     whole = roll_out(
@@ -191,7 +191,7 @@ def test_the_mirrored_hand_in_the_mirrored_scene_has_the_mirrored_motion(
 ) -> None:
     sample = samples[1]
     control = control_of(trajectories_of(sample), sample.object_model)
-    left = hands_of(HANDS, sample.betas, None)["left"]
+    left = mano_hands(HANDS, sample.betas, None)["left"]
     model = replace(
         sample.object_model,
         vertices_m=sample.object_model.vertices_m * [-1, 1, 1],
@@ -218,7 +218,7 @@ def test_the_mirrored_hand_in_the_mirrored_scene_has_the_mirrored_motion(
 
 def test_an_object_in_each_hand_is_sensed_by_that_hand(fingers: FingerSampler, samples: list[ClipSample]) -> None:
     sample = samples[0]
-    control, hands = control_of(trajectories_of(sample), sample.object_model), hands_of(HANDS, sample.betas, None)
+    control, hands = control_of(trajectories_of(sample), sample.object_model), mano_hands(HANDS, sample.betas, None)
     moved_object = replace(
         control, object_motion=replace(control.object_motion, position_m=control.object_motion.position_m + 0.1)
     )
@@ -346,7 +346,7 @@ def test_new_fingers_depend_on_the_poses_before_and_after_the_gap(
     sample, frames = samples[0], slice(9, 20)
     control, hand = (
         control_of(trajectories_of(sample), sample.object_model),
-        hands_of(HANDS, sample.betas, None)["right"],
+        mano_hands(HANDS, sample.betas, None)["right"],
     )
     recorded = finger_rotmats_of(sample.hands[1])
     gap = Gap(frames.start, frames.stop, recorded[8], recorded[20])

@@ -11,12 +11,13 @@ import torch
 from hoidata.clips.clip import Side
 from hoidata.datasets.base import RawTree, SequenceKey
 from hoidata.datasets.manipnet.adapter import read_hand_recording
+from hoidata.geometry.motion import Motion
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.sensors.mano_hand import mano_hand
 from models.common.training import TrainingConfig, learning_rate_factor
-from models.manipnet.control import Control, Motion
+from models.manipnet.control import Control
 from models.manipnet.family import joint_errors_m
 from models.manipnet.features import FeatureSettings, mirrored_to_right
 from models.manipnet.network import ManipNet, NetworkConfig

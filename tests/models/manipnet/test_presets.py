@@ -13,6 +13,7 @@ from hoidata.batches.dataset import ClipSample
 from hoidata.clips.clip import FPS, SIDES, Clip, Side
 from hoidata.datasets import RawTree
 from hoidata.datasets.manipnet.adapter import read_hand_recording
+from hoidata.geometry.motion import Motion
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands
@@ -21,12 +22,13 @@ from hoidata.objects.distance import SignedDistance
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.sensors import sense
+from hoidata.sensors.mano_hand import mano_hands
 from hoidata.settings import build_config
 from hoidata.store.annotated import AnnotatedStore
 from models.common.family import Sources
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.training import TrainingSpec, train_network
-from models.manipnet.control import Control, Motion, hands_of
+from models.manipnet.control import Control
 from models.manipnet.family import FingerSampler
 from models.manipnet.features import FeatureSettings, hand_inputs, outputs, pose_features, trajectory_features
 from models.manipnet.network import ManipNet, NetworkConfig
@@ -223,7 +225,7 @@ def test_an_untracked_frame_ends_the_steps_at_60_hz(samples: list[ClipSample]) -
 
 def test_a_rollout_at_60_hz_gives_every_second_pose_at_30_hz(samples: list[ClipSample]) -> None:
     torch.manual_seed(0)
-    hand, model = hands_of(HANDS, samples[0].betas, None)["right"], box_model()
+    hand, model = mano_hands(HANDS, samples[0].betas, None)["right"], box_model()
     settings = FeatureSettings(step_s=1 / 60)
     network = ManipNet(sized_config(NetworkConfig(encoder=8, features=settings), hand)).eval()
     side: Side = "right"

@@ -7,12 +7,13 @@ import pytest
 import torch
 
 from hoidata.clips.clip import SIDES, Side
+from hoidata.geometry.motion import Motion
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.sensors.mano_hand import mano_hand
-from models.manipnet.control import Control, Motion
+from models.manipnet.control import Control
 from models.manipnet.features import FeatureSettings
 from models.manipnet.network import NetworkConfig
 from models.manipnet.rollout import Predictor, RolloutTask, roll_out

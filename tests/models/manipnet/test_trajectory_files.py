@@ -10,11 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import SIDES
 from hoidata.errors import BadInput
+from hoidata.geometry.motion import Motion
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.user_mesh import UNITS_M
 from hoidata.sensors.mano_hand import mano_hand
-from models.manipnet.animate import at_30_fps, blend_ends, control_from_file, interpolated
-from models.manipnet.control import Control, Motion
+from models.manipnet.animate import at_rate, blend_ends, control_from_file, interpolated
+from models.manipnet.control import Control
 from models.manipnet.plausible import reading
 from models.manipnet.trajectory_files import PARTS, Axes, parse_csv, parse_manipnet, read_trajectories
 from tests.builders.objects import box_model, model_of, notebook
@@ -98,6 +99,32 @@ def test_a_table_is_read_with_its_columns_in_any_order() -> None:
     assert checked_control(table()).active == ["right"]
 
 
+@pytest.mark.parametrize("lost", [",nan", ","])
+def test_frames_in_which_a_body_is_lost_are_left_out_and_long_gaps_are_refused(lost: str) -> None:
+    head, *lines = table().splitlines()
+    whole = checked_control(table()).control.at(np.arange(FRAMES) / 30)
+
+    def without(body: str, frames: slice) -> str:
+        first = 1 if body == "object" else 8
+        table_cells = [line.split(",") for line in lines]
+        for cells in table_cells[frames]:
+            cells[first : first + 7] = lost.split(",")[1:] * 7
+        return "\n".join([head, *map(",".join, table_cells)])
+
+    for body in ("object", "right"):
+        checked = checked_control(without(body, slice(2, 4)))
+        assert checked.active == ["right"]
+        control = checked.control.at(np.arange(FRAMES) / 30)
+        np.testing.assert_allclose(control.wrists["right"].position_m, whole.wrists["right"].position_m, atol=1e-3)
+        np.testing.assert_allclose(control.object_motion.rotmats, whole.object_motion.rotmats, atol=1e-3)
+    with pytest.raises(BadInput, match="neither"):
+        parse_csv(without("right", slice(None)).encode(), "mine.csv")
+    lines = with_last_time("1.1").splitlines()[1:]
+    for frames, words in ((slice(1, None), "right lost for 1.10 s; cut"), (slice(1, 5), "right lost for 1.10 s; cut")):
+        with pytest.raises(BadInput, match=f"gaps of at most 1 s, got {words}"):
+            parse_csv(without("right", frames).encode(), "mine.csv")
+
+
 def test_npz_and_csv_give_the_same_trajectories_in_metres(tmp_path: Path) -> None:
     from_csv = parse_csv(table().encode(), "mine.csv")
     quaternion = Rotation.from_matrix(from_csv.wrists["right"].rotmats).as_quat()[:, [3, 0, 1, 2]]
@@ -168,8 +195,8 @@ def test_a_wrist_in_the_hollow_of_a_mug_is_refused() -> None:
         checked_control(table(scale=0.01), mug)
 
 
-def test_the_other_wrist_axes_are_named_if_only_they_are_plausible() -> None:
-    with pytest.raises(BadInput, match="--wrist-axes model"):
+def test_wrists_in_other_axes_are_refused_and_the_error_names_both_remedies() -> None:
+    with pytest.raises(BadInput, match=r"\(--wrist-axes\) or measure them \(--calibration\)"):
         checked_control(table(), axes="canonical")
 
 
@@ -187,7 +214,7 @@ def test_too_many_frames_at_30_per_second_are_refused() -> None:
     times = np.linspace(0, 1e9, 3)
     still = Motion(times, np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3)))
     with pytest.raises(BadInput, match="at most 200000 frames"):
-        at_30_fps(Control(dict.fromkeys(SIDES, still), still, BOX))
+        at_rate(Control(dict.fromkeys(SIDES, still), still, BOX))
 
 
 def test_quaternions_with_w_last_are_refused_in_nearly_every_world_and_w_first_in_none() -> None:
