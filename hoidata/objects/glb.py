@@ -206,10 +206,10 @@ class _Scene:
         for weight, target in zip(weights, primitive.get("targets", ()), strict=False):
             if weight and "POSITION" in target:
                 points = points + float(weight) * self._accessor(target["POSITION"])
-        order = np.arange(len(points)) if "indices" not in primitive else self._accessor(primitive["indices"]).ravel()
+        order = np.arange(len(points)) if "indices" not in primitive else self._integers(primitive["indices"]).ravel()
         mode = primitive.get("mode", _TRIANGLES)
         _check_count(len(order) // 3 if mode == _TRIANGLES else len(order) - 2)
-        faces = _triangles(order.astype(np.int64), mode)
+        faces = _triangles(order, mode)
         if len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
             raise ValueError(f"corner {faces.max()} of {len(points)} vertices")
         return Mesh(points.astype(np.float64), faces)
@@ -225,7 +225,7 @@ class _Scene:
         homogeneous = np.column_stack((points, np.ones(len(points))))
         moved = np.zeros((len(points), 3))
         for joint, weight in zip(joints.T, weights.T, strict=True):
-            matrices = scene_from_joint[joint.astype(np.int64), :3]
+            matrices = scene_from_joint[joint, :3]
             moved += weight[:, None] * np.einsum("vij,vj->vi", matrices, homogeneous)
         return moved
 
@@ -236,9 +236,16 @@ class _Scene:
             attributes = primitive["attributes"]
             if "JOINTS_1" in attributes:
                 raise ValueError("more than four joints at a vertex: apply the armature, then export again")
-            joints.append(self._accessor(attributes["JOINTS_0"]))
+            joints.append(self._integers(attributes["JOINTS_0"]))
             weights.append(self._accessor(attributes["WEIGHTS_0"]))
         return np.concatenate(joints), np.concatenate(weights)
+
+    def _integers(self, number: int) -> np.ndarray:
+        """(element, component) indices; floating-point components are refused."""
+        values = self._accessor(number)
+        if values.dtype.kind not in "iu":
+            raise ValueError("indices that are no integers")
+        return values.astype(np.int64)
 
     def _accessor(self, number: int) -> np.ndarray:
         """(element, component) values; normalized integers are scaled to -1 or 0 to 1 (section 3.6.2)."""

@@ -287,6 +287,7 @@ FAULTS = {
     "more vertices and corners": change(("accessors", 0, "count"), 10**9),
     "an accessor of -1": change(("accessors", 0, "count"), -1),
     "the number -1": change(("nodes", 0, "mesh"), -1),
+    "indices that are no integers": change(("meshes", 0, "primitives", 0, "indices"), 0),  # the positions
     "positions of 1": change(("meshes", 0, "primitives", 0, "attributes", "POSITION"), 1),
     "another file": change(("buffers",), [{"uri": "secret.bin", "byteLength": 9}]),
     "node 0 in two places": change(("scenes",), [{"nodes": [0, 0]}]),
