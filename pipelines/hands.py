@@ -17,7 +17,7 @@ from hoidata.files import sha256_file
 from hoidata.files.numpy_files import load_npz_arrays
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.metrics.unmeasured import Unmeasured
-from hoidata.metrics.verdict import UNKNOWN_UP, verdict, verdict_lines
+from hoidata.metrics.verdict import UNKNOWN_UP, fewest_failed, verdict, verdict_lines
 from hoidata.object_paths import keyframed_path, read_keyframes
 from hoidata.object_paths.path import MAX_S, PathStep, check_pace, joint_range_words
 from hoidata.objects.model import ObjectModel
@@ -65,6 +65,7 @@ class HandsOptions:
     hinge_range: str = ""  # degrees, such as "0:110"
     hand: HandType = "both"
     samples: int = 1
+    keep: int | None = None  # samples to keep, by the verdict; None: all
     seed: int = 0
     length_s: float | None = None  # None keeps the source's duration
     model: str = ""  # the dataset whose networks to use; "" for the first that has them
@@ -101,8 +102,10 @@ def hands_files(
     networks = read_info(paths.checkpoints / BIMART.uses[-1] / FILE_NAME)["facts"]
     training_data = f"{paths.checkpoints} (trained on {trained_on(networks)})"
     facts = [("object's motion", motion.source), ("networks", training_data)]
-    notes = [*motion.notes, *_notes(samples)]
     checks = [verdict(sample.clip, project.hands, motion.up) for sample in samples]
+    kept = fewest_failed(checks, options.keep)
+    samples, checks = [samples[number] for number in kept], [checks[number] for number in kept]
+    notes = [*motion.notes, *_notes(samples)]
     written = write_hands(out, samples, project.hands, motion.steps, digests, facts, checks, notes)
     clips, info = [sample.clip for sample in samples], dict[str, Any]()
     if options.clip:

@@ -116,6 +116,14 @@ def summary(checks: Sequence[Check]) -> str:
     return f"all {measured} checks pass" + f", {len(checks) - measured} not measured" * (measured < len(checks))
 
 
+def fewest_failed(verdicts: Sequence[Sequence[Check]], count: int | None) -> list[int]:
+    """Indices of the ``count`` motions that fail the fewest checks, the best first; all in order if None."""
+    numbers = list(range(len(verdicts)))
+    if count is None:
+        return numbers
+    return sorted(numbers, key=lambda number: sum(check.passed is False for check in verdicts[number]))[:count]
+
+
 def verdict_lines(number: int, checks: Sequence[Check]) -> list[str]:
     """The verdict on one sample, for the terminal."""
     return [f"sample {number + 1}: {summary(checks)}", *(f"  {one.result}: {one.name}: {one.words}" for one in checks)]

@@ -330,6 +330,9 @@ def hands(
     clip: Annotated[str, typer.Option(help="Id of a stored clip whose object and motion to use.")] = "",
     motion: Annotated[str, typer.Option(help="A motion.npz of `hoidata generate` whose object motion to use.")] = "",
     samples: Annotated[int, typer.Option(help="Number of motions to generate.", min=1, max=16)] = 1,
+    keep: Annotated[
+        int | None, typer.Option(help="Keep this many samples, those that fail the fewest checks. Default: all.", min=1)
+    ] = None,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     hand: Annotated[Literal["left", "right", "both"], typer.Option(help="Hands that act.")] = "both",
     length: Annotated[
@@ -366,6 +369,7 @@ def hands(
         hinge_range=hinge_range,
         hand=hand,
         samples=samples,
+        keep=keep,
         seed=seed,
         length_s=length,
         model=model,

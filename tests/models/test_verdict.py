@@ -17,6 +17,7 @@ from hoidata.metrics.verdict import (
     UNKNOWN_UP,
     Check,
     RequestedVerb,
+    fewest_failed,
     summary,
     verdict,
     verdict_lines,
@@ -288,3 +289,10 @@ def test_the_usual_up_direction_of_each_training_object(annotated: AnnotatedStor
         clip = annotated.clip(clip_id)
         rotation = Rotation.from_rotvec(clip.object.rotvec[0])
         assert rotation.apply(ups[clip.object.model.name]) @ clip.gravity < -0.9
+
+
+def test_the_samples_that_fail_the_fewest_checks_are_kept_the_best_first() -> None:
+    """A check that was not measured does not count as failed."""
+    results: list[list[bool | None]] = [[False, False, True], [True, None, None], [True, False, True], [True] * 3]
+    verdicts = [[Check("touches", passed, "") for passed in one] for one in results]
+    assert [fewest_failed(verdicts, count) for count in (None, 1, 3, 9)] == [[0, 1, 2, 3], [1], [1, 3, 2], [1, 3, 2, 0]]
