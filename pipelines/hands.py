@@ -103,8 +103,8 @@ def hands_files(
     training_data = f"{paths.checkpoints} (trained on {trained_on(networks)})"
     facts = [("object's motion", motion.source), ("networks", training_data)]
     checks = [verdict(sample.clip, project.hands, motion.up) for sample in samples]
-    kept = fewest_failed(checks, options.keep)
-    samples, checks = [samples[number] for number in kept], [checks[number] for number in kept]
+    chosen_samples = fewest_failed(checks, options.keep)
+    samples, checks = [samples[number] for number in chosen_samples], [checks[number] for number in chosen_samples]
     notes = [*motion.notes, *_notes(samples)]
     written = write_hands(out, samples, project.hands, motion.steps, digests, facts, checks, notes)
     clips, info = [sample.clip for sample in samples], dict[str, Any]()

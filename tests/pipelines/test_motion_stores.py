@@ -186,8 +186,8 @@ def test_motions_for_a_recorded_clip_are_evaluated_against_it(command, stores, p
 def test_kept_hands_are_one_of_the_samples(project, stores, monkeypatch) -> None:
     monkeypatch.chdir(project)
     typed(*COMMANDS["hands"], "--keep", "1", "--out", "out/kept")
-    (kept,) = (project / "out/kept").glob("motion*.npz")
-    assert kept.read_bytes() == (project / "out/hands" / kept.name).read_bytes()
+    (path,) = (project / "out/kept").glob("motion*.npz")
+    assert path.read_bytes() == (project / "out/hands" / path.name).read_bytes()
 
 
 def test_a_generated_motion_keeps_the_verb_and_the_sentence(stores) -> None:
