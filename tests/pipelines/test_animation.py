@@ -196,8 +196,8 @@ def streamed(source: str, *words: str) -> list[dict]:
     names, *rows = [line.split(",") for line in Path(source).read_text().splitlines()]
     bodies = dict.fromkeys(name.rsplit("_", 1)[0] for name in names[1:])
     datagrams = []
-    for row in rows:
-        columns = dict(zip(names, map(float, row), strict=True))
+    for cells in rows:
+        columns = dict(zip(names, map(float, cells), strict=True))
         poses = {body: [columns[f"{body}_{part}"] for part in PARTS] for body in bodies}
         datagrams.append(json.dumps({"time_s": columns["time_s"], **poses}).encode())
     tracker = threading.Thread(target=send_when_open, args=(port := free_port(), [*datagrams, b'{"end": true}']))

@@ -154,6 +154,7 @@ def test_the_object_motion_of_a_generated_file_keeps_mesh_and_hinge(tmp_path):
         ({"keyframes": REST, "object": "nothing.obj"}, "correct the path"),
         ({"keyframes": "time_s,hinge_deg 0,0 1,10"}, "--hinge"),
         ({"keyframes": REST, "mesh": MeshOptions("m")}, "--unit cm"),
+        ({"keyframes": REST, "object": "box", "mesh": MeshOptions(scale=2.0)}, "--scale: expected a mesh file"),
         ({"keyframes": REST, "hinge_range": "110"}, "0:110"),
         ({"keyframes": REST, "hinge_range": "10:110"}, "0:110"),
         (

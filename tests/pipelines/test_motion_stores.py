@@ -158,7 +158,7 @@ def test_croissant_reads_the_tables_of_every_store(command, stores, tmp_path) ->
     shutil.copy(tmp_path / "export" / "croissant.json", folder)
     dataset = mlcroissant.Dataset(jsonld=folder / "croissant.json")
     assert not dataset.metadata.ctx.issues.errors
-    ids = [row["meta_sequences/clip_id"].decode() for row in dataset.records("meta_sequences")]
+    ids = [sequence["meta_sequences/clip_id"].decode() for sequence in dataset.records("meta_sequences")]
     assert ids == open_store(folder).ids
 
 
