@@ -32,12 +32,10 @@ from models.common.sampling import SamplerConfig
 from models.common.training import TrainingConfig, fit, learning_rate_factor, train_network
 from models.registry import load_network
 from models.text2hoi.diffusion import DiffusionModel, MotionGenerator
-from models.text2hoi.generation import GeneratedMotion, Generator, MotionOptions, closed_as_stored
+from models.text2hoi.generation import GeneratedMotion, Generator, MotionOptions
 from models.text2hoi.length import LengthModel
 from models.text2hoi.sampler import SamplingConfig
 from pipelines.generation import GenerationRequest, Models, generate_files
-from tests.builders.clips import DOWN, clip_of, flat_hand, still_object
-from tests.builders.objects import hinged_box
 from tests.models.toy import PARAMS, train
 
 
@@ -390,26 +388,6 @@ def test_own_meshes_get_the_axis_up_that_was_up_in_training(trained: Path, monke
     )
     assert generated.clip.object.model is z_up
     assert next(check for check in expected.verdict if check.name == "stands upright").passed is None
-
-
-def test_a_lid_starts_as_stored_and_its_hand_moves_with_it() -> None:
-    pair, model, frames = load_embedded_hands(), hinged_box(), 12
-    hinge_rad = np.linspace(0.5, 1.1, frames).astype(np.float32)
-    track = replace(still_object(model, frames), hinge_rad=hinge_rad)
-    lid_m = track.points_in_world(model.vertices_m, model.part)[:, model.part == 1].mean(axis=1)
-    base_m = np.tile(model.vertices_m[model.part == 0].mean(axis=0) - [0, 0, 0.03], (frames, 1))
-    clip = clip_of("generated/box", track, {"left": flat_hand(base_m), "right": flat_hand(lid_m)}, gravity=DOWN)
-    closed = closed_as_stored(clip, pair)
-    assert closed.object.hinge_rad is not None
-    np.testing.assert_allclose(closed.object.hinge_rad, hinge_rad - 0.5, atol=1e-6)
-    np.testing.assert_array_equal(closed.hands["left"].wrist_m, clip.hands["left"].wrist_m)
-    in_lid_m = [
-        model.object_from_part(1, one.object.hinge_rad).inverse()
-        @ (one.object.world_from_object.inverse() @ track_joints(one.hands["right"], pair.right).astype(np.float64))
-        for one in (clip, closed)
-    ]
-    np.testing.assert_allclose(in_lid_m[0], in_lid_m[1], atol=1e-5)
-    assert closed_as_stored(replace(clip, object=still_object(user_box(), frames)), pair).hands == clip.hands
 
 
 @pytest.mark.parametrize("name", ["steps", "batch", "validate_every", "micro_batches", "save_every"])
