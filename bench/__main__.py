@@ -1,6 +1,6 @@
 """``python -m bench [NAME ...]``: the benchmarks named (see ``BENCHMARKS``), or all but those ``ON_REQUEST``.
 
-``python -m bench table1 CORPUS`` and ``table2 CORPUS`` make tables of Text2HOI (``paper_tables``).
+``python -m bench table1 CORPUS``, ``table2 CORPUS`` and ``presets CORPUS`` make tables of Text2HOI (``paper_tables``).
 
 Every result stands next to a named baseline of the same run; variants take turns and medians of several runs are shown.
 Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder with the embedded raw corpora.
@@ -25,7 +25,7 @@ ON_REQUEST = ("bimart-tables", "recordings", "soak", "speed")  # they need data 
 
 
 def main() -> int:
-    if sys.argv[1:2] and (name := sys.argv[1]) in ("table1", "table2"):
+    if sys.argv[1:2] and (name := sys.argv[1]) in ("table1", "table2", "presets"):
         return paper_tables.make(name, " ".join(sys.argv[2:]))
     chosen = sys.argv[1:] or [name for name in BENCHMARKS if name not in ON_REQUEST]
     unknown = sorted(set(chosen) - set(BENCHMARKS))

@@ -1,9 +1,11 @@
-"""Text2HOI's Tables 1 and 2 on this project's corpora: every row is a project setting, trained, sampled and measured.
+"""Text2HOI's Tables 1 and 2, and presets `paper` and `ours`, on this project's corpora: every row is a project setting,
+trained, sampled and measured.
 
-``python -m bench table1 CORPUS`` and ``python -m bench table2 CORPUS``; ``table1.yaml`` and ``table2.yaml`` have
-settings, runs, rows and columns. CORPUS: embedded (a quick check), study, or arctic (recordings in HOIDATA_ARCTIC, MANO
-files in HOIDATA_MANO). HOIDATA_BENCH_OUT: the project folder (.hoidata/table1-CORPUS), which all runs use in turn.
-Finished runs are in its ``results.json``, so a killed command continues. ``table.md`` has the tables.
+``python -m bench table1 CORPUS``, likewise ``table2`` and ``presets``; ``table1.yaml`` and the others have settings,
+runs, rows and columns. CORPUS: embedded (a quick check), study, or arctic (recordings in HOIDATA_ARCTIC, MANO files in
+HOIDATA_MANO); ``presets`` also has composition and object, other splits of study. HOIDATA_BENCH_OUT: the project folder
+(.hoidata/table1-CORPUS), which all runs use in turn; ``presets`` in the folder of ``table1`` does not train again.
+Finished runs are in its ``table1.json``, so a killed command continues. ``table1.md`` has the tables.
 """
 
 import json
@@ -36,7 +38,7 @@ LEGEND = (
     "±: 95 % interval over repetitions of sampling. In parentheses: 95 % interval over clips, of metrics that are "
     "measured on one repetition. Both are means over training seeds; sd: standard deviation over training seeds."
 )
-# ``results.json``: by ``<run> <seed>`` the digest of its settings, processor seconds by stage, and metrics by method.
+# ``table1.json``: by ``<run> <seed>`` the digest of its settings, processor seconds by stage, and metrics by method.
 Results = Mapping[str, Mapping[str, Any]]
 # By seed: ``value``, and its intervals ``repetitions`` and ``clips`` if there are any.
 Seeds = Sequence[Mapping[str, Any]]
@@ -74,7 +76,7 @@ class Row:
 class PaperTable:
     """One of the YAML files, for a corpus."""
 
-    name: str  # table1 or table2
+    name: str  # table1, table2 or presets
     corpus: str
 
     @cached_property
@@ -88,8 +90,12 @@ class PaperTable:
             names = ", ".join(self.content["corpora"])
             raise BadInput(f"bench {self.name}", f"one of {names}", self.corpus or "no corpus", "name one of them")
         recordings = load_yaml((FOLDER / "recordings.yaml").read_bytes()) if self.corpus == "arctic" else {}
-        base = {name: recordings[name] for name in ("profile", "datasets", "convert", "split") if recordings}
-        return merge_settings(merge_settings(base, self.content["settings"]), self.content["corpora"][self.corpus])
+        settings = {name: recordings[name] for name in ("profile", "datasets", "convert", "split") if recordings}
+        base = [PaperTable(self.content["settings_of"], self.corpus)] if "settings_of" in self.content else []
+        for content in (table.content for table in (*base, self)):
+            settings = merge_settings(settings, content["settings"])
+            settings = merge_settings(settings, content["corpora"].get(self.corpus, {}))
+        return settings
 
     @property
     def dataset(self) -> str:
@@ -114,8 +120,8 @@ class PaperTable:
         }
 
     def fill(self, project: Path) -> Results:
-        """Make every run that ``results.json`` of the project does not have with the same settings."""
-        path, profile = project / "results.json", self.settings["profile"]
+        """Make every run that ``table1.json`` of the project does not have with the same settings."""
+        path, profile = project / f"{self.name}.json", self.settings["profile"]
         results = json.loads(path.read_text()) if path.is_file() else {}
         for name, settings in self.runs().items():
             digest = value_digest(settings)
@@ -219,7 +225,7 @@ def make(name: str, corpus: str) -> int:
     project = Path(os.environ.get("HOIDATA_BENCH_OUT", f".hoidata/{name}-{corpus}")).resolve()
     results = table.fill(project)
     text = f"# {table.content['title']}: {corpus}, {table.dataset}\n\n{table.markdown(results)}"
-    (project / "table.md").write_text(text)
+    (project / f"{name}.md").write_text(text)
     print(text)
     checked = {run: check_orderings(content["methods"], STATIC) for run, content in results.items()}
     failed = [(run, one.ordering) for run, orderings in checked.items() for one in orderings if one.holds is False]

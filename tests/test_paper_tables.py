@@ -24,7 +24,11 @@ from pipelines.params import load_yaml, read_params
 from pipelines.stages.families import families_of
 from pipelines.stages.train import TrainParams
 
-ALL = [PaperTable(*pair) for pair in product(("table1", "table2"), ("embedded", "study", "arctic"))]
+ALL = [
+    *(PaperTable(*pair) for pair in product(("table1", "table2", "presets"), ("embedded", "study", "arctic"))),
+    PaperTable("presets", "composition"),
+    PaperTable("presets", "object"),
+]
 ACCURACY, FID = METRIC["accuracy_top1_paper"], METRIC["fid_paired_paper"]
 
 
@@ -68,6 +72,13 @@ def test_all_generators_of_table_1_take_equally_many_steps(corpus):
     networks = PaperTable("table1", corpus).settings["train"]["small"]
     steps = {name: networks[name]["training"]["steps"] for name in networks}
     assert steps["diffusion"] == steps["mdm"] == steps["imos"] == steps["t2m-movement"] + steps["t2m"]
+
+
+@pytest.mark.parametrize("corpus", ["study", "arctic"])
+def test_the_presets_are_trained_as_in_table_1(corpus):
+    runs = [PaperTable(name, corpus).runs() for name in ("presets", "table1")]
+    assert all(runs[0][name]["train"] == runs[1][name]["train"] for name in ("ours 0", "paper 0"))
+    assert runs[0]["best-of-5 0"]["train"] == runs[0]["ours 0"]["train"]
 
 
 def test_every_run_of_table_2_changes_another_part():
@@ -138,7 +149,7 @@ def test_the_command_fails_if_the_static_control_is_as_good_as_the_recordings(
     monkeypatch.setenv("HOIDATA_BENCH_OUT", str(tmp_path))
     assert make("table1", "embedded") == code
     assert ("static does not fall in accuracy_top1_paper" in capsys.readouterr().err) == bool(code)
-    text = (tmp_path / "table.md").read_text()
+    text = (tmp_path / "table1.md").read_text()
     assert "| MDM | 0.600 ± 0.248" in text
     assert "| Text2HOI | 0.9218 |" in text
 

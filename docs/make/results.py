@@ -1,7 +1,7 @@
 """Tables of README.md and docs/results.md, from the metrics in docs/results: `python -m docs.make.results` writes them.
 
 `python -m docs.make.results arctic=PROJECT/metrics/own/arctic` first replaces docs/results/arctic.json by those of a
-run, and `table1-arctic=PROJECT/results.json` copies the results of `bench/paper_tables.py`. Their table is written in
+run, and `table1-arctic=PROJECT/table1.json` copies the results of `bench/paper_tables.py`. Their table is written in
 place of `<!--results:table1-arctic-->` to `<!--end-->`. A test compares the pages with the files.
 """
 
