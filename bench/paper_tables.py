@@ -199,9 +199,9 @@ def cell(line: Row, results: Results, metric: AnyMetric) -> str:
         return line.reason(results, metric.name).partition(":")[0]
     text, values = number(mean_value(seeds)), {seed["value"] for seed in seeds}
     if (half := half_width(seeds, "repetitions")) is not None:
-        text += f" ± {number(half)}"
+        text += f"±{number(half)}"
     elif ends := [seed["clips"] for seed in seeds if "clips" in seed]:
-        text += " ({} to {})".format(*(number(mean(end)) for end in zip(*ends, strict=True)))
+        text += " ({}–{})".format(*(number(mean(end)) for end in zip(*ends, strict=True)))
     return text + (f", sd {number(stdev(seed['value'] for seed in seeds))}" if len(values) > 1 else "")
 
 
