@@ -32,10 +32,9 @@ from hoidata.datasets.oakink2 import files as oakink2
 from hoidata.errors import BadInput
 from hoidata.files import array_pieces, arrays, npy_header, numpy_files, pickle_check, restricted_pickle, torch_pickle
 from hoidata.hands import load_embedded_hands, mano, model
-from hoidata.object_paths import keyframes
+from hoidata.object_paths import keyframes, trajectory_files
 from hoidata.objects import glb, mesh, ply, stl, urdf, user_mesh
 from hoidata.store import mapped, store
-from models.manipnet import trajectory_files
 from pipelines import params
 from pipelines.lineage import manifests
 from pipelines.stages import base

@@ -18,6 +18,14 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.metrics.verdict import summary, verdict, verdict_lines
+from hoidata.object_paths.trajectory_files import (
+    ENDINGS,
+    MAX_FRAMES,
+    MIN_FRAMES,
+    Axes,
+    TrajectoryFile,
+    read_trajectories,
+)
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import is_object_path, read_user_object
 from hoidata.sensors.mano_hand import mano_hands
@@ -43,7 +51,6 @@ from models.manipnet.network import ManipNet
 from models.manipnet.rollout import Predictor, Rule
 from models.manipnet.stream import Stream, TrackedFrame, control_of_frames, tracked_frames
 from models.manipnet.training import MANIPNET
-from models.manipnet.trajectory_files import ENDINGS, MAX_FRAMES, Axes, TrajectoryFile, read_trajectories
 from pipelines.command_inputs import (
     MeshOptions,
     ProjectData,
@@ -63,6 +70,7 @@ from pipelines.stages.base import StagePaths, load_hands
 Method = Literal["auto", "network", "interpolate"]
 ARRAYS = SHARED | {
     "made": "(S, F) whether the fingers were generated",
+    "time_s": "(F,) of the file or tracker; of a clip, since its first frame",
     "left_object_rotvec": "(F, 3) as object_rotvec, of another object in the left hand",
     "left_object_translation_m": "(F, 3) as object_translation_m",
 }
@@ -120,6 +128,12 @@ class AnimationOptions:
         if self.up not in UPS:
             raise BadInput("--world-up", "x, y or z", self.up, "name the axis of the file's world that points up")
 
+    def check_for_tracker(self) -> None:
+        """Raise BadInput for an option that applies only to a file of trajectories."""
+        for option, value in {"--trajectory-unit": self.unit, "--wrist-axes": self.axes}.items():
+            if value not in ("", "model"):
+                raise BadInput(option, "no such option with a tracker, which sends metres", value, "convert its poses")
+
 
 ShowPoses = Callable[[float, Mapping[Side, np.ndarray]], None]  # seconds, (15, 3, 3) rotations by side
 # Predictor, hands to animate, trajectories of the file and at 30 fps; gives (frame, 15, 3, 3) by side at 30 fps.
@@ -158,6 +172,7 @@ class Animation:
     network_facts: Mapping[str, Any] = field(default_factory=dict)  # empty if the fingers are interpolated
     source_info: Mapping[str, Any] = field(default_factory=dict)  # of the store of an animated clip
     fps: int = FPS
+    first_s: float = 0.0  # time of the first frame
 
 
 def animate_files(
@@ -217,6 +232,7 @@ def stream_files(
 def _written(animation: Animation, out: Path, store: Path | None) -> WrittenFiles:
     hands, ghosts, generated, info = animation.hands, animation.ghosts, animation.generated, animation.source_info
     arrays = motion_arrays(animation.clip, hands) | {"made": generated, "fps": np.array(animation.fps)}
+    arrays["time_s"] = animation.first_s + np.arange(animation.clip.n_frames) / animation.fps
     clip = animation.clip.take(slice(None, None, animation.fps // FPS))  # of the other files
     left_objects = () if info else clip.other_objects  # those of a recorded clip are others
     sides: list[Side] = [side for side, frames in zip(SIDES, generated, strict=True) if frames.any()]
@@ -340,7 +356,7 @@ def _stream_fingers(
 ) -> dict[Side, np.ndarray]:
     frames = tracked_frames(tracked)
     models: dict[Side, ObjectModel] = {side: control.of(side).model for side in SIDES}
-    _, poses = _played(predictor, hands, models, _at_recorded_speed(frames) if in_real_time else frames, show)
+    _, poses, _ = _played(predictor, hands, models, _at_recorded_speed(frames) if in_real_time else frames, show)
     return _poses_of_frames(poses, predictor, hands, len(control.object_motion.time_s))
 
 
@@ -350,15 +366,15 @@ def _played(
     models: dict[Side, ObjectModel],
     frames: Iterable[TrackedFrame],
     show: ShowPoses,
-) -> tuple[list[TrackedFrame], list[dict[Side, np.ndarray]]]:
-    """Push frames through a stream; return those that are not late, with times of its clock, and all poses."""
+) -> tuple[list[TrackedFrame], list[dict[Side, np.ndarray]], int]:
+    """Push frames through a stream; return those used, with times of its clock, all poses, and the number dropped."""
     start: dict[Side, np.ndarray] = {side: hand.rest_rotmats for side, hand in hands.items()}
     stream = Stream(predictor, hands, models, start)
     accepted, shown = list[TrackedFrame](), list[dict[Side, np.ndarray]]()
 
     def show_all(poses: list[dict[Side, np.ndarray]]) -> None:
         for pose in poses:
-            show(len(shown) * predictor.settings.step_s, pose)
+            show(stream.first_s + len(shown) * predictor.settings.step_s, pose)
             shown.append(pose)
 
     for frame in frames:
@@ -369,7 +385,7 @@ def _played(
         if len(accepted) == MAX_FRAMES:
             break
     show_all(stream.finish())
-    return accepted, shown
+    return accepted, shown, stream.dropped
 
 
 def _at_recorded_speed(frames: Iterable[TrackedFrame]) -> Iterator[TrackedFrame]:
@@ -393,6 +409,7 @@ def _from_tracker(
     source: str, options: AnimationOptions, project: ProjectData, show: ShowPoses, report: Callable[[str], None]
 ) -> Animation:
     """Animate a tracker's frames until they end; a hand is invalid while its wrist is lost."""
+    options.check_for_tracker()
     address = parse_address(source)
     network = chosen_network(options, project)
     models, notes = _objects(options, options.mesh.unit, project)
@@ -405,21 +422,24 @@ def _from_tracker(
         offsets, offset_notes = offsets_of(recording, user_hands, options.sides)
         notes += offset_notes
         received = (calibrated_frame(frame, offsets) for frame in received)
-    frames, poses = _played(predictor, hands, models, received, show)
-    notes.append(f"{tracker.refused} of {tracker.received} datagrams were refused")
+    frames, poses, dropped = _played(predictor, hands, models, received, show)
+    notes.append(
+        f"{tracker.refused} of {tracker.received} datagrams were refused; {dropped} had a time, in seconds, that was "
+        "repeated, late or not followed by another one within half a second"
+    )
     control, valid = control_of_frames(frames, models["right"])
     if control and options.left_object:
         left, _ = control_of_frames(frames, models["left"], "left")
         control = left and replace(control, left=left)
-    if control is None or not valid[[side in hands for side in SIDES]].any():
-        got = f"none in {len(frames)} frames"
-        raise BadInput(source, "poses of the object and of a wrist", got, "send them (docs/fingers.md)")
+    if control is None or len(frames) < MIN_FRAMES or not valid[[side in hands for side in SIDES]].any():
+        expected, got = f"poses of object and wrist in {MIN_FRAMES} frames", f"{len(frames)} frames; {notes[-1]}"
+        raise BadInput(source, expected, got, "send them (docs/fingers.md)")
     fingers = _poses_of_frames(poses, predictor, hands, valid.shape[1])
     clip = clip_of(control, fingers, templates_m, UPS[options.up], "live", network.is_synthetic)
     generated = valid & np.array([[side in hands] for side in SIDES])
-    tracks = {side: replace(clip.hands[side], valid=tracked) for side, tracked in zip(SIDES, generated, strict=True)}
     rows = [*network.rows, _objects_row(models), ("source", source)]
-    return Animation(replace(clip, hands=tracks), generated, {}, project.hands, rows, notes, network.facts)
+    clip, first_s = _valid_where(clip, generated), frames[0].time_s
+    return Animation(clip, generated, {}, project.hands, rows, notes, network.facts, first_s=first_s)
 
 
 def _from_file(
@@ -454,8 +474,20 @@ def _from_file(
     generated[[SIDES.index(side) for side in animated]] = True
     up = trajectories.up or UPS[options.up]
     clip = clip_of(control, fingers, templates_m, up, path.stem, network.is_synthetic)
-    rows = [*network.rows, _objects_row(models)]
-    return Animation(clip, generated, {}, project.hands, rows, notes, network.facts, fps=options.fps)
+    time_s = control.object_motion.time_s
+    tracked = np.stack([checked.control.wrists[side].covers(time_s) for side in SIDES])
+    clip, generated = _valid_where(clip, tracked), generated & tracked
+    rows, first_s = [*network.rows, _objects_row(models)], float(time_s[0])
+    return Animation(clip, generated, {}, project.hands, rows, notes, network.facts, fps=options.fps, first_s=first_s)
+
+
+def _valid_where(clip: Clip, tracked: np.ndarray) -> Clip:
+    """The clip whose hands are invalid in frames in which they are not tracked; tracked: (2, frame) bool."""
+    hands = {
+        side: replace(clip.hands[side], valid=clip.hands[side].valid & frames)
+        for side, frames in zip(SIDES, tracked, strict=True)
+    }
+    return replace(clip, hands=hands)
 
 
 def _user_hands(

@@ -7,6 +7,7 @@ import numpy as np
 from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
 
+_ROUNDING_S = 1e-6
 _FRAME_TOLERANCE = 1e-6  # of a frame's duration: a time this close to a frame takes its pose without interpolation
 
 
@@ -17,6 +18,10 @@ class Motion:
     time_s: np.ndarray  # (frame,) increasing
     rotmats: np.ndarray  # (frame, 3, 3) world_from_body
     position_m: np.ndarray  # (frame, 3)
+
+    def covers(self, time_s: np.ndarray) -> np.ndarray:
+        """Whether times are within those of the frames."""
+        return (time_s >= self.time_s[0] - _ROUNDING_S) & (time_s <= self.time_s[-1] + _ROUNDING_S)
 
     def at(self, time_s: np.ndarray) -> RigidTransform:
         """Interpolate ``world_from_body`` at times of any shape; constant before the first and after the last frame.

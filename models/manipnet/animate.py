@@ -12,12 +12,12 @@ from hoidata.geometry.motion import Motion, interpolate_rotations
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands.kinematics import track_rotmats
 from hoidata.hands.tracked_hand import TrackedHand
+from hoidata.object_paths.trajectory_files import MAX_FRAMES, TrajectoryFile
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from models.manipnet.control import Control
 from models.manipnet.plausible import plausible_reading
 from models.manipnet.rollout import Predictor, RolloutTask, roll_out
-from models.manipnet.trajectory_files import MAX_FRAMES, TrajectoryFile
 
 SEAM_S = 1.0  # predicted fingers are blended to the recorded poses before and after them over this time
 MAX_INTERPOLATED_S = 2.0  # in a gap up to this, interpolation has a lower error than the network (docs/fingers.md)
@@ -42,7 +42,8 @@ def control_from_file(file: TrajectoryFile, model: ObjectModel, hands: Mapping[S
         remedy = 'give the hinge of a two-piece mesh (--hinge "px,py,pz dx,dy,dz"), or remove the column'
         raise BadInput(file.source, "an object with a hinge for hinge_rad", f"{model.name!r}, which is rigid", remedy)
     accepted = plausible_reading(file, model, hands)
-    notes = [
+    notes = [*file.notes]
+    notes += [
         f"the {side} hand stays {metres:.2f} m away from the object and keeps its neutral pose"
         for side, metres in accepted.nearest_m.items()
         if side not in accepted.active

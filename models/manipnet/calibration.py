@@ -11,8 +11,8 @@ from hoidata.geometry.motion import Motion
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.hands.tracker_offset import tracker_from_wrist
+from hoidata.object_paths.trajectory_files import TrajectoryFile
 from models.manipnet.stream import TrackedFrame
-from models.manipnet.trajectory_files import TrajectoryFile
 
 Offsets = Mapping[Side, RigidTransform]  # tracker_from_wrist of each hand
 

@@ -3,7 +3,7 @@
 A frame: ``{"time_s": 1.25, "object": [x, y, z, qw, qx, qy, qz], "left": null, "right": [...], "hinge_rad": 0.3}``, with
 metres, seconds of any clock, and ``hinge_rad`` for a hinged object. A missing body, null or NaN: the tracker lost it.
 With an object in each hand, ``left_object`` is the left hand's.
-``{"end": true}`` ends the stream. A pose: ``{"time_s": 0.5, "left": [[x, y, z], ...], "right": ...}``, axis-angles.
+``{"end": true}`` ends the stream. A pose: ``{"time_s": 1.25, "left": [[x, y, z], ...], "right": ...}``, axis-angles.
 """
 
 import json
@@ -23,8 +23,8 @@ from hoidata.clips.clip import SIDES, Side
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.geometry.transform import RigidTransform
+from hoidata.object_paths.trajectory_files import BODIES
 from models.manipnet.stream import TrackedFrame
-from models.manipnet.trajectory_files import BODIES
 
 MAX_BYTES = 4096
 NAMES = {"time_s", "hinge_rad", *BODIES}
@@ -125,7 +125,8 @@ class Tracker:
                         except BadInput as error:
                             self.refused += 1
                             if self.refused <= MAX_REPORTS:
-                                self.report(str(error))
+                                is_last = self.refused == MAX_REPORTS
+                                self.report(f"{error}; further ones are only counted" if is_last else str(error))
                             continue
                         if frame is None:
                             return

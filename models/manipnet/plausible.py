@@ -16,12 +16,12 @@ from hoidata.clips.clip import SIDES, Side
 from hoidata.errors import BadInput
 from hoidata.geometry.motion import Motion
 from hoidata.hands.tracked_hand import TrackedHand
+from hoidata.object_paths.trajectory_files import TrajectoryFile
 from hoidata.objects.convex_hull import convex_hull
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.objects.user_mesh import UNITS_M
 from models.manipnet.control import Control, untracked_wrist
-from models.manipnet.trajectory_files import TrajectoryFile
 
 NEAR_M = 0.12  # from the palm centre to the object; a hand that never comes this close is not active
 PALM_M = 0.08  # from the wrist to the palm centre

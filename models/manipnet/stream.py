@@ -4,8 +4,9 @@
   Gaps up to the look-ahead are interpolated. In a longer gap the hand keeps its fingers.
 - After such a gap or a jump, the body starts a new trajectory, as at the start of a recording, and the fingers are
   blended from the kept to the predicted pose.
-- Frames that are not later than the one before are dropped. After ``MAX_LATE_FRAMES`` earlier ones, or a pause of more
-  than ``MAX_PAUSE_S``, the stream's clock continues from the new time.
+- Frames that are not later than the one before are dropped, as is a frame after a pause that no other follows within
+  the look-ahead. After ``MAX_LATE_FRAMES`` earlier ones, or a pause of more than ``MAX_PAUSE_S``, the stream's clock
+  continues from the new time: its times then differ from the tracker's.
 """
 
 import operator
@@ -20,6 +21,7 @@ from hoidata.clips.clip import FPS, SIDES, Side
 from hoidata.geometry.motion import Motion, interpolate_rotations
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import TrackedHand
+from hoidata.object_paths.trajectory_files import MAX_SPEED_M_S
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from models.manipnet.control import Control, untracked_wrist
@@ -30,7 +32,7 @@ MARGIN_S = 0.25  # frames kept before the oldest trajectory sample, whose veloci
 ROUNDING_S = 1e-6
 BLEND_S = 0.3
 MAX_GAP_S = 0.5  # a wrist lost for longer makes frames of a recording invalid
-MAX_SPEED_M_S, MAX_TURN_RAD_S = 10.0, 40.0  # a faster body has jumped; recorded wrists reach 4 m/s
+MAX_TURN_RAD_S = 40.0  # a body that turns faster has jumped
 MAX_LATE_FRAMES, MAX_PAUSE_S = 10, 5.0
 MAX_POSITION_M, ROTATION_TOLERANCE = 1e3, 1e-3  # of a usable pose; the tolerance is that of R R^T - I
 
@@ -192,11 +194,13 @@ class Stream:
         self._wrists: dict[Side, list[Trajectory]] = {side: [] for side in SIDES}
         self._objects: dict[Side, list[Trajectory]] = {side: [] for side in self.hands}
         self.pose_count, self.first_s, self.last_s = 0, -np.inf, -np.inf  # times of the first and last frame
-        self._clock_offset_s, self._late_frames = 0.0, 0
+        self._clock_offset_s, self._late_frames, self._unconfirmed_s = 0.0, 0, -np.inf
+        self.dropped = 0  # frames with a time that was not used
 
     def push(self, frame: TrackedFrame) -> list[dict[Side, np.ndarray]]:
         """Add a frame and return the poses that are now complete, by side (joint - 1, 3, 3): often none or several."""
         if not np.isfinite(frame.time_s) or not self._advance_clock(frame.time_s):
+            self.dropped += 1
             return []
         for side in SIDES:
             if is_usable(pose := frame.wrists.get(side)):
@@ -211,7 +215,7 @@ class Stream:
 
     def finish(self) -> list[dict[Side, np.ndarray]]:
         """End the stream: return the poses not yet returned, as if wrists and objects rested after the last frame."""
-        return list(self._ready_poses(np.inf))
+        return list(self._ready_poses(np.inf)) if np.isfinite(self.first_s) else []
 
     def exchange(self, side: Side, model: ObjectModel) -> None:
         """Replace the object of a hand after the last frame; its tracked pose then moves the new mesh."""
@@ -227,6 +231,9 @@ class Stream:
         is_repeated = abs(elapsed_s) < ROUNDING_S
         if is_repeated or (elapsed_s < 0 and self._late_frames < MAX_LATE_FRAMES):
             self._late_frames += not is_repeated
+            return False
+        if elapsed_s > self._ahead_s and not 0 < time_s - self._unconfirmed_s <= self._ahead_s:
+            self._unconfirmed_s = time_s  # one wrong time must not move the clock
             return False
         if not 0 < elapsed_s <= MAX_PAUSE_S:  # count it as a pause that starts new trajectories
             self._clock_offset_s += self._ahead_s + MARGIN_S - elapsed_s

@@ -31,6 +31,15 @@ MeshHinge = Annotated[
     typer.Option(help="Hinge of a mesh of two pieces, 'px,py,pz dx,dy,dz': point and direction; a slide: direction."),
 ]
 Moving = Annotated[str, typer.Option(help="What moves: joint of a URDF, or pieces of a mesh with --hinge.")]
+TrajectoryUnit = Annotated[
+    str, typer.Option(help="Unit of positions in .csv and .npz files: m, cm, mm, dm or inch. Default: m.")
+]
+WristAxes = Annotated[
+    Literal["model", "canonical"],
+    typer.Option(
+        help="Wrist axes in .csv and .npz files: the hand model's, or canonical (x to the fingers, y to the thumb)."
+    ),
+]
 LeftObject = Annotated[str, typer.Option(help="Another rigid object in the left hand (docs/fingers.md).")]
 HandLength = Annotated[
     float | None,
@@ -217,15 +226,8 @@ def animate(
         Literal["preset", "ours", "paper", "off"],
         typer.Option(help="Post-processing of predicted fingers: preset (the network's), ours, paper, off."),
     ] = "preset",
-    trajectory_unit: Annotated[
-        str, typer.Option(help="Unit of positions in .csv and .npz files: m, cm, mm, dm or inch. Default: m.")
-    ] = "",
-    wrist_axes: Annotated[
-        Literal["model", "canonical"],
-        typer.Option(
-            help="Wrist axes in .csv and .npz files: the hand model's, or canonical (x to the fingers, y to the thumb)."
-        ),
-    ] = "model",
+    trajectory_unit: TrajectoryUnit = "",
+    wrist_axes: WristAxes = "model",
     left_object: LeftObject = "",
     calibration: Calibration = "",
     hand_length: HandLength = None,
@@ -283,6 +285,8 @@ def stream(
     fast: Annotated[bool, typer.Option("--fast", help="Do not wait for the times of a file.")] = False,
     fingers: Fingers = "both",
     model: Annotated[str, typer.Option(help="Dataset whose network to use. Default: the first with a network.")] = "",
+    trajectory_unit: TrajectoryUnit = "",
+    wrist_axes: WristAxes = "model",
     left_object: LeftObject = "",
     calibration: Calibration = "",
     hand_length: HandLength = None,
@@ -308,6 +312,8 @@ def stream(
         model=model,
         object=object,
         left_object=left_object,
+        unit=trajectory_unit,
+        axes=wrist_axes,
         up=world_up,
         calibration=calibration,
         hand_length_cm=hand_length,

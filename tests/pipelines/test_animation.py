@@ -19,11 +19,11 @@ from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import TIP_VERTICES, load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.hands.tracker_offset import sheet_from_wrist
+from hoidata.object_paths.trajectory_files import PARTS
 from hoidata.sensors.mano_hand import mano_hand
 from hoidata.store.store import open_store
 from models.common.training import train_network
 from models.manipnet.training import MANIPNET
-from models.manipnet.trajectory_files import PARTS
 from pipelines.cli import app
 from tests.builders.clips import build_clip
 from tests.builders.stores import write_annotated
@@ -280,6 +280,43 @@ def test_motion_npz_has_the_given_frame_rate_and_the_other_files_have_30(typed) 
     for name in ("wrist_m", "hand_pose", "object_translation_m"):
         np.testing.assert_allclose(arrays[name][..., ::2, :], plain[name], atol=1e-3)
     np.testing.assert_allclose(arrays["object_translation_m"][:, 0], np.arange(7) * 0.005, atol=1e-6)
+
+
+def test_at_the_ends_a_lost_object_cuts_the_motion_and_a_lost_wrist_makes_frames_invalid(tiny: Path, typed) -> None:
+    lines = [line.split(",") for line in (tiny / "mine.csv").read_text().splitlines()]
+    lines[1][1:8], lines[4][8:15] = [""] * 7, [""] * 7
+    (tiny / "ends.csv").write_text("\n".join(map(",".join, lines)))
+    arrays, page = typed("ends.csv", "--object", "mug.obj")
+    np.testing.assert_allclose(arrays["time_s"], np.arange(1, 4) / 30)
+    assert arrays["valid"][1].tolist() == arrays["made"][1].tolist() == [True, True, False]
+    assert "the motion is cut to 0.03 to 0.10 s, where the object is tracked" in page
+
+
+def test_a_streamed_file_has_a_unit_and_a_tracker_has_none(tiny: Path, typed, monkeypatch) -> None:
+    rows = [line.split(",") for line in (tiny / "mine.csv").read_text().splitlines()]
+    for cells in rows[1:]:
+        for column in (1, 2, 3, 8, 9, 10):
+            cells[column] = str(100 * float(cells[column]))
+    (tiny / "cm.csv").write_text("\n".join(map(",".join, rows)))
+    words = ("--object", "mug.obj", "--trajectory-unit", "cm")
+    expected, _ = typed("cm.csv", *words)
+    command = ("stream", "--from", "cm.csv", "--fast", "--out", "live", *words)
+    lines = CliRunner().invoke(app, command, catch_exceptions=False).stdout.splitlines()
+    poses = np.reshape([json.loads(line)["right"] for line in lines], (4, 45))
+    np.testing.assert_allclose(poses, expected["hand_pose"][1], atol=1e-4)
+    with pytest.raises(BadInput, match="a tracker, which sends metres"):
+        CliRunner().invoke(app, ["stream", "--from", "udp://:9000", "--out", "live", *words], catch_exceptions=False)
+
+
+def test_a_tracker_without_a_usable_frame_ends_with_the_reason(tiny: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tiny)
+    tracker = threading.Thread(target=send_when_open, args=(port := free_port(), [b'{"time_s":"1"}', b'{"end": true}']))
+    tracker.start()
+    command = ["stream", "--from", f"udp://:{port}", "--out", "none", "--object", "mug.obj"]
+    with pytest.raises(BadInput, match="in 3 frames, got 0 frames; .* datagrams were refused"):
+        CliRunner().invoke(app, command, catch_exceptions=False)
+    tracker.join()
+    assert not (tiny / "none").exists()
 
 
 def test_manipnets_text_file_and_mesh_are_mirrored(typed) -> None:

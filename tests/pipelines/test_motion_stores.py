@@ -20,9 +20,9 @@ from hoidata.errors import BadInput
 from hoidata.files.numpy_files import load_npz_arrays
 from hoidata.hands import load_embedded_hands
 from hoidata.metrics.evaluate import evaluate_store
+from hoidata.object_paths.trajectory_files import PARTS
 from hoidata.store.store import open_store
 from models.common.training import train_network
-from models.manipnet.trajectory_files import PARTS
 from models.registry import load_network
 from pipelines import command_inputs
 from pipelines.cli import app

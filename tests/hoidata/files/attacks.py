@@ -21,9 +21,9 @@ from hoidata.files.checksums import read_metadata
 from hoidata.files.numpy_files import load_npz_arrays, load_npz_objects
 from hoidata.files.restricted_pickle import ARRAYS, restricted_load
 from hoidata.files.torch_pickle import load_torch_pickle
+from hoidata.object_paths.trajectory_files import read_trajectories
 from hoidata.objects.mesh import LARGEST_MESH_BYTES, load_mesh, parse_obj
 from hoidata.objects.user_mesh import read_user_object
-from models.manipnet.trajectory_files import read_trajectories
 
 MB = 1 << 20
 Attack = tuple[str, Callable[[], bytes], Callable[[Path], Any]]

@@ -13,10 +13,10 @@ from hoidata.geometry.motion import Motion
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracker_offset import WRIST_M, sheet_from_wrist
+from hoidata.object_paths.trajectory_files import PARTS, TrajectoryFile, parse_csv
 from hoidata.sensors.mano_hand import mano_hand
 from models.manipnet.calibration import calibrated_file, calibrated_frame, offsets_of
 from models.manipnet.datagrams import parse_frame
-from models.manipnet.trajectory_files import PARTS, TrajectoryFile, parse_csv
 
 HANDS = {side: mano_hand(load_embedded_hands(), side) for side in SIDES}
 RATE_HZ, REST_FRAMES = 60, 180

@@ -311,6 +311,24 @@ def test_a_clock_that_is_set_delays_the_stream_by_a_moment_only(trained: Predict
     assert abs(count + len(stream.finish()) - STEP_HZ * 4.75) <= 6
 
 
+@pytest.mark.parametrize("ahead_s", [3.0, 1e3])
+def test_one_wrong_time_changes_nothing_but_its_frame(trained: Predictor, whole, ahead_s: float) -> None:
+    frames = [*frames_of(tracked(TRACKER_HZ, 3.0))]
+    frames.insert(60, replace(frames[60], time_s=frames[60].time_s + ahead_s))
+    stream = new_stream(trained)
+    poses = [pose for one in frames for pose in stream.push(one)] + stream.finish()
+    np.testing.assert_array_equal(points_m("right", poses), points_m("right", whole))
+    assert stream.dropped == 1
+
+
+def test_times_in_milliseconds_are_dropped_and_a_stream_without_frames_ends(trained: Predictor) -> None:
+    stream = new_stream(trained)
+    assert stream.finish() == []
+    poses = [stream.push(replace(one, time_s=1e3 * one.time_s)) for one in frames_of(tracked(TRACKER_HZ, 1.0))]
+    assert stream.dropped == TRACKER_HZ
+    assert len([pose for ready in poses for pose in ready] + stream.finish()) == 1
+
+
 def test_an_exchanged_object_is_sensed_and_the_fingers_do_not_jump(trained: Predictor) -> None:
     control, poses = tracked(TRACKER_HZ, 4.0), {}
     for exchanged in (False, True):

@@ -12,12 +12,12 @@ from hoidata.clips.clip import SIDES
 from hoidata.errors import BadInput
 from hoidata.geometry.motion import Motion
 from hoidata.hands import load_embedded_hands
+from hoidata.object_paths.trajectory_files import PARTS, Axes, parse_csv, parse_manipnet, read_trajectories
 from hoidata.objects.user_mesh import UNITS_M
 from hoidata.sensors.mano_hand import mano_hand
 from models.manipnet.animate import at_rate, blend_ends, control_from_file, interpolated
 from models.manipnet.control import Control
 from models.manipnet.plausible import reading
-from models.manipnet.trajectory_files import PARTS, Axes, parse_csv, parse_manipnet, read_trajectories
 from tests.builders.objects import box_model, model_of, notebook
 
 HANDS = {side: mano_hand(load_embedded_hands(), side) for side in SIDES}
@@ -123,6 +123,50 @@ def test_frames_in_which_a_body_is_lost_are_left_out_and_long_gaps_are_refused(l
     for frames, words in ((slice(1, None), "right lost for 1.10 s; cut"), (slice(1, 5), "right lost for 1.10 s; cut")):
         with pytest.raises(BadInput, match=f"gaps of at most 1 s, got {words}"):
             parse_csv(without("right", frames).encode(), "mine.csv")
+
+
+def test_semicolons_decimal_commas_tabs_and_other_columns_do_not_matter() -> None:
+    expected = parse_csv(table().encode(), "mine.csv").wrists["right"].position_m
+    with_comment = [f"{line},{'note' if number == 0 else 'ok'}" for number, line in enumerate(table().splitlines())]
+    texts = [table().replace(",", ";").replace(".", ","), table().replace(",", "\t"), "\n".join(with_comment)]
+    for text in texts:
+        np.testing.assert_array_equal(parse_csv(text.encode(), "mine.csv").wrists["right"].position_m, expected)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("right_", "Right_", "object, left or right.*got Right_x"),
+        ("\n0.0333", "\nsoon", "row 2, time_s: expected a number, got 'soon"),
+        ("object_qz,", "object_qz,left_arm_x,", "object, left or right.*got left_arm_x"),
+    ],
+)
+def test_a_mistake_in_a_table_is_named_with_its_row_and_column(old: str, new: str, words: str) -> None:
+    both = "\n".join(line + "," + ",".join(line.split(",")[-7:]) for line in table().splitlines())
+    head, rest = both.split("\n", 1)
+    names = head.split(",")
+    text = "\n".join([",".join([*names[:15], *(name.replace("right", "left") for name in names[15:])]), rest])
+    with pytest.raises(BadInput, match=words):
+        parse_csv(text.replace(old, new).encode(), "mine.csv")
+
+
+def test_an_infinite_number_is_named_with_its_row() -> None:
+    *lines, last = table().splitlines()
+    text = "\n".join([*lines, ",".join([last.split(",")[0], "inf", *last.split(",")[2:]])])
+    with pytest.raises(BadInput, match=rf"object_position: expected finite .* got \[ *inf .*in row {FRAMES}"):
+        parse_csv(text.encode(), "mine.csv")
+
+
+def test_a_body_that_jumps_to_zero_is_lost_and_one_that_rests_there_is_not() -> None:
+    lines = [line.split(",") for line in table().splitlines()]
+    for cells in lines[3:5]:
+        cells[8:15] = ["0", "0", "0", "1", "0", "0", "0"]
+    jumping = parse_csv("\n".join(map(",".join, lines)).encode(), "mine.csv")
+    assert len(jumping.wrists["right"].time_s) == FRAMES - 2
+    for cells in lines[1:]:
+        cells[1:8] = ["0", "0", "0", "1", "0", "0", "0"]
+    resting = parse_csv("\n".join(map(",".join, lines)).encode(), "mine.csv")
+    assert len(resting.object_body.time_s) == FRAMES
 
 
 def test_npz_and_csv_give_the_same_trajectories_in_metres(tmp_path: Path) -> None:

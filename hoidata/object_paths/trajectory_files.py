@@ -1,10 +1,13 @@
 """Trajectories of wrists and an object from files: CSV, NPZ, and the text files of ManipNet's demo.
 
-CSV: a header, then one line per frame, columns in any order: ``time_s``, and for each of ``object``, ``left`` and
-``right`` (one hand may be missing) the seven ``<body>_x _y _z _qw _qx _qy _qz``; ``hinge_rad`` for a hinged object.
-With an object in each hand, ``left_object`` is the left hand's, and ``object`` the right hand's.
+CSV, with commas, semicolons or tabs: a header, then one line per frame, columns in any order: ``time_s``, and for each
+of ``object``, ``left`` and ``right`` (one hand may be missing) the seven ``<body>_x _y _z _qw _qx _qy _qz``;
+``hinge_rad`` for a hinged object. With an object in each hand, ``left_object`` is the left hand's, and ``object`` the
+right hand's. Other columns are ignored, unless they are named like those of a body. After semicolons, decimals may have
+commas.
 NPZ: ``time_s (frame,)``, ``<body>_position (frame, 3)``, ``<body>_quaternion (frame, 4)`` with w first, ``hinge_rad``.
-A body is lost in frames with an empty cell or NaN; gaps of up to ``MAX_STEP_S`` are interpolated.
+A body is lost in frames with an empty cell or NaN, or if it jumps to 0, 0, 0 unrotated, as some trackers write; gaps of
+up to ``MAX_STEP_S`` are interpolated.
 Positions are in metres or the given unit, in a right-handed world. The object's pose is that of its mesh file's frame.
 A wrist's pose has the axes of the hand model's wrist joint ("model"), or "canonical" axes: x to the fingers, y to the
 thumb and z out of the back of a right hand; a left hand is the mirror image with x away from the fingers.
@@ -15,9 +18,9 @@ decimetres with y up; the object's position is the centre of its bounding box.
 
 import csv
 import io
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Literal
 
@@ -36,8 +39,10 @@ PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 ENDINGS = (".csv", ".npz", ".txt")
 MAX_RATE_HZ, MIN_RATE_HZ = 1000.0, 5.0
 MAX_STEP_S = 1.0  # interpolation over a longer pause would be a guess
+MAX_SPEED_M_S = 10.0  # a faster body has jumped; recorded wrists reach 4 m/s
 MAX_ABS_VALUE = 1e30  # its square is still finite
-MAX_BYTES, MAX_FRAMES, MAX_LINE_LENGTH = 64 * 2**20, 200_000, 1 << 16
+MIN_FRAMES, MAX_FRAMES = 3, 200_000
+MAX_BYTES, MAX_LINE_LENGTH = 64 * 2**20, 1 << 16
 MANIPNET_UNIT = "dm"  # of the release's trajectories and meshes
 _MIRROR_POSITION, _MIRROR_QUATERNION = np.array([-1.0, 1, 1]), np.array([1.0, 1, -1, -1])
 
@@ -57,6 +62,7 @@ class TrajectoryFile:
     up: tuple[float, float, float] | None = None  # of the world; None if the format does not define it
     mesh_unit: str = ""  # of the meshes that belong to this format
     unit: str = "m"  # of the positions as given by the user; "" if the format defines unit and axes
+    notes: tuple[str, ...] = ()  # for the user
 
     def with_bodies(self, change: Callable[[Motion], Motion]) -> "TrajectoryFile":
         wrists: dict[Side, Motion] = {side: change(body) for side, body in self.wrists.items()}
@@ -100,20 +106,28 @@ def read_trajectories(path: Path, unit: str = "", axes: Axes = "model") -> Traje
 def parse_csv(data: bytes, source: str, unit: str = "m") -> TrajectoryFile:
     """Parse the CSV format from any bytes."""
     try:
+        lines = _lines(data)
+        header = next(lines, "")
+        separator = max(",;\t", key=header.count)
         # One row more than allowed shows that there are too many, without reading them all.
-        rows = list(islice(filter(None, csv.reader(_lines(data))), MAX_FRAMES + 2))
+        rows = list(islice(filter(None, csv.reader(chain([header], lines), delimiter=separator)), MAX_FRAMES + 2))
     except (UnicodeDecodeError, csv.Error) as error:
         raise BadInput(source, "CSV text", f"{type(error).__name__}: {error}", "export it again") from error
     names = [name.strip() for name in rows[0]] if rows else []
     if len(set(names)) < len(names):
         raise BadInput(source, "a header with each column once", ", ".join(names)[:200], "correct the header")
-    table = _numbers(rows[1:], len(names), source)
-    columns = dict(zip(names, table.T, strict=True))
-    bodies = [body for body in BODIES if body == "object" or any(f"{body}_{part}" in columns for part in PARTS)]
+    bodies = [body for body in BODIES if body == "object" or any(f"{body}_{part}" in names for part in PARTS)]
     required = ["time_s", *(f"{body}_{part}" for body in bodies for part in PARTS)]
-    if missing := [name for name in required if name not in columns]:
-        got = f"none named {', '.join(missing)}"
-        raise BadInput(source, "columns time_s and <object, left or right>_<x, y, z, qw, qx, qy, qz>", got, "add them")
+    expected = "columns time_s and <object, left or right>_<x, y, z, qw, qx, qy, qz>"
+    if missing := [name for name in required if name not in names]:
+        raise BadInput(source, expected, f"none named {', '.join(missing)}", "add them")
+    read = [*required, *({"hinge_rad"} & set(names))]
+    if unknown := [name for name in names if name not in read and name.rpartition("_")[2] in PARTS and "_" in name]:
+        raise BadInput(source, expected, f"{', '.join(unknown)}"[:200], "correct the names, or remove the columns")
+    if separator == ";":
+        rows = [[cell.replace(",", ".") for cell in row] for row in rows]
+    chosen = [names.index(name) for name in read]
+    columns = dict(zip(read, _numbers(rows[1:], names, source, chosen).T, strict=True))
     arrays = {"time_s": columns["time_s"]}
     for body in bodies:
         values = np.stack([columns[f"{body}_{part}"] for part in PARTS], axis=1)
@@ -153,18 +167,22 @@ def from_arrays(arrays: Mapping[str, np.ndarray], source: str, unit: str = "m") 
         if gap_s > MAX_STEP_S or not len(body.time_s):
             expected, got = f"gaps of at most {MAX_STEP_S:g} s", f"{name} lost for {gap_s:.2f} s"
             raise BadInput(source, expected, got, "cut the file there")
-    return TrajectoryFile(source, wrists, object_body, hinge, objects.get("left_object"), unit=unit)
+    first_s, last_s = object_body.time_s[[0, -1]]
+    is_cut = first_s > time_s[0] or last_s < time_s[-1]
+    notes = (f"the motion is cut to {first_s:.2f} to {last_s:.2f} s, where the object is tracked",) if is_cut else ()
+    return TrajectoryFile(source, wrists, object_body, hinge, objects.get("left_object"), unit=unit, notes=notes)
 
 
 def parse_manipnet(data: bytes, source: str) -> TrajectoryFile:
     """Parse ManipNet's text format, uncompressed, from any bytes."""
     nonempty_lines = (line for line in io.StringIO(data.decode("utf-8", "replace"), newline=None) if line.strip())
     lines = list(islice(nonempty_lines, MAX_FRAMES + 2))
-    rate = _numbers([[lines[0]]], 1, source)[0, 0] if lines else 0.0
+    rate = _numbers([[lines[0]]], ["frame rate"], source)[0, 0] if lines else 0.0
     if not MIN_RATE_HZ <= rate <= MAX_RATE_HZ:
         remedy = "the first line of ManipNet's files is 120; other trajectories need the format .csv or .npz"
         raise BadInput(source, "a frame rate in the first line", f"{lines[0][:40] if lines else 'nothing'}", remedy)
-    table = _numbers([line.split(",") for line in lines[1:]], 21, source)
+    names = [f"number {number + 1}" for number in range(21)]
+    table = _numbers([line.split(",") for line in lines[1:]], names, source)
     arrays = {"time_s": np.arange(len(table)) / rate}
     for number, body in enumerate(BODIES[:3]):
         columns = table[:, 7 * number : 7 * number + 7]
@@ -174,18 +192,25 @@ def parse_manipnet(data: bytes, source: str) -> TrajectoryFile:
     return replace(trajectories, axes="canonical", at_box=True, up=(0.0, 1.0, 0.0), mesh_unit=MANIPNET_UNIT, unit="")
 
 
-def _numbers(rows: list[list[str]], count: int, source: str) -> np.ndarray:
-    """(row, count) numbers; NaN for an empty cell."""
+def _numbers(
+    rows: list[list[str]], names: Sequence[str], source: str, chosen: Sequence[int] | None = None
+) -> np.ndarray:
+    """(row, chosen column) numbers; NaN for an empty cell. names: of all columns."""
+    chosen = range(len(names)) if chosen is None else chosen
     if len(rows) > MAX_FRAMES:
         raise BadInput(source, f"at most {MAX_FRAMES} frames", f"{len(rows)}", "cut it into pieces")
+    table = np.empty((len(rows), len(chosen)))
     for number, cells in enumerate(rows):
-        if len(cells) != count:
-            raise BadInput(f"{source}: row {number + 1}", f"{count} numbers", f"{len(cells)}", "correct the row")
-    try:
-        table = [[float(word) if word.strip() else np.nan for word in cells] for cells in rows]
-    except ValueError as error:
-        raise BadInput(source, "numbers", str(error)[:200], "correct the file") from error
-    return np.array(table, np.float64).reshape(len(rows), count)
+        where = f"{source}: row {number + 1}"
+        if len(cells) != len(names):
+            raise BadInput(where, f"{len(names)} numbers", f"{len(cells)}", "correct the row")
+        for place, column in enumerate(chosen):
+            try:
+                table[number, place] = float(cells[column]) if cells[column].strip() else np.nan
+            except ValueError as error:
+                got = ascii(cells[column][:40])
+                raise BadInput(f"{where}, {names[column]}", "a number", got, "correct it") from error
+    return table
 
 
 def _array(
@@ -204,14 +229,18 @@ def _array(
     is_number = array.dtype.kind in "fiu"
     if not fits or not is_number or not ((np.abs(array) < MAX_ABS_VALUE) | (may_be_lost & np.isnan(array))).all():
         expected = f"finite numbers of shape ({count or 'frame'}, {', '.join(map(str, shape))})"
-        raise BadInput(f"{source}: {name}", expected, f"{array.dtype} {array.shape}", "correct it")
+        got = f"{array.dtype} {array.shape}"
+        if fits and is_number:
+            bad = ~(np.abs(array) < MAX_ABS_VALUE).reshape(len(array), -1).all(axis=1)
+            got = f"{array[bad.argmax()]} in row {bad.argmax() + 1}"
+        raise BadInput(f"{source}: {name}", expected, got, "correct it")
     return array.astype(np.float64)
 
 
 def _check_times(time_s: np.ndarray, source: str) -> None:
     steps = np.diff(time_s)
-    if len(time_s) < 3 or (steps <= 0).any() or len(time_s) > MAX_FRAMES:
-        expected = f"3 to {MAX_FRAMES} frames whose times rise"
+    if len(time_s) < MIN_FRAMES or (steps <= 0).any() or len(time_s) > MAX_FRAMES:
+        expected = f"{MIN_FRAMES} to {MAX_FRAMES} frames whose times rise"
         late = "" if len(time_s) < 2 or (steps > 0).all() else f", not after row {int((steps <= 0).argmax()) + 1}"
         raise BadInput(f"{source}: time_s", expected, f"{len(time_s)} frames{late}", "correct the times")
     step = float(np.median(steps))
@@ -236,6 +265,7 @@ def _body(arrays: Mapping[str, np.ndarray], body: str, time_s: np.ndarray, sourc
         for name, count in (("position", 3), ("quaternion", 4))
     )
     is_lost = np.isnan(np.c_[position, quaternion]).any(axis=1)
+    is_lost |= _jumps_to_zero(position * unit_m, quaternion, time_s)
     quaternion[is_lost] = [1.0, 0.0, 0.0, 0.0]
     length = np.linalg.norm(quaternion, axis=1)
     if np.abs(length - 1).max() > 0.01:
@@ -244,3 +274,11 @@ def _body(arrays: Mapping[str, np.ndarray], body: str, time_s: np.ndarray, sourc
         raise BadInput(f"{source}: {body}", "quaternions of length 1", got, "write w, x, y, z of a rotation")
     rotmats = Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_matrix()
     return Motion(time_s[~is_lost], rotmats[~is_lost], position[~is_lost] * unit_m)
+
+
+def _jumps_to_zero(position_m: np.ndarray, quaternion: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+    """(frame,) bool: position 0 and no rotation, if the body is too fast to have been there."""
+    is_zero = (np.c_[position_m, quaternion] == [0.0, 0, 0, 1, 0, 0, 0]).all(axis=1)
+    is_border = is_zero[1:] != is_zero[:-1]
+    speed_m_s = np.linalg.norm(np.diff(position_m, axis=0), axis=1) / np.diff(time_s)
+    return is_zero & bool((speed_m_s[is_border] > MAX_SPEED_M_S).any())
