@@ -313,7 +313,7 @@ def test_a_tracker_without_a_usable_frame_ends_with_the_reason(tiny: Path, monke
     tracker = threading.Thread(target=send_when_open, args=(port := free_port(), [b'{"time_s":"1"}', b'{"end": true}']))
     tracker.start()
     command = ["stream", "--from", f"udp://:{port}", "--out", "none", "--object", "mug.obj"]
-    with pytest.raises(BadInput, match="in 3 frames, got 0 frames; .* datagrams were refused"):
+    with pytest.raises(BadInput, match=r"in 3 frames, got 0 frames; .* datagrams were refused"):
         CliRunner().invoke(app, command, catch_exceptions=False)
     tracker.join()
     assert not (tiny / "none").exists()
