@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 from hoidata.errors import BadInput
 from hoidata.geometry.rows import distinct_rows
 from hoidata.objects.glb import Glb, parse_glb
+from hoidata.objects.joint_checks import check_axis_is_near
 from hoidata.objects.mesh import Mesh, NamedPieces, checked_mesh, load_named_mesh, read_mesh_bytes
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.stl import parse_stl
@@ -48,6 +49,11 @@ def is_object_path(name: str) -> bool:
     return isfile(name) or (isdir(name) and find_urdf(Path(name)) is not None)
 
 
+def unknown_object_words(name: str) -> str:
+    """The name, and that it is a folder without a URDF file if it is; for messages on an unknown object."""
+    return f"{name}, a folder without a .urdf file" if isdir(name) else name
+
+
 def read_user_object(
     path: Path, unit: str = "", up: str = "", hinge: str = "", moving: str = "", factor: float = 1.0
 ) -> UserObject:
@@ -70,6 +76,8 @@ def read_user_object(
     body = _body(path, hinge, moving)
     mesh, notes = body.mesh, list(body.notes)
     scale = _scale(path, mesh, unit, factor)
+    if hinge and body.hinge:
+        check_axis_is_near(mesh.vertices, body.hinge, unit or "m", UNITS_M)
     vertices = mesh.vertices * scale
     if not up:
         up, note = _usual_up(path) or guess_up(vertices)
@@ -270,14 +278,6 @@ def _named_as_moving(path: Path, file: _MeshFile, moving: Sequence[str]) -> Name
     )
 
 
-def piece_names(path: Path) -> tuple[str, str] | None:
-    """Names of the two pieces of which ``--hinge`` rotates the second ("" if unnamed); None for any other mesh."""
-    pieces = _division_into_two(_divisions(_read(path)))
-    if pieces is None:
-        return None
-    first, second = _order(pieces)
-    return (pieces.names[first], pieces.names[second]) if pieces.names else ("", "")
-
 def _names_upwards(pieces: NamedPieces, number: int) -> list[str]:
     """The name of a piece, then those of the nodes above it, with which it moves."""
     names = [pieces.names[number]] if number < len(pieces.names) else [""]
@@ -285,6 +285,14 @@ def _names_upwards(pieces: NamedPieces, number: int) -> list[str]:
         names.append(pieces.names[number])
     return names
 
+
+def piece_names(path: Path) -> tuple[str, str] | None:
+    """Names of the two pieces of which ``--hinge`` rotates the second ("" if unnamed); None for any other mesh."""
+    pieces = _division_into_two(_divisions(_read(path)))
+    if pieces is None:
+        return None
+    first, second = _order(pieces)
+    return (pieces.names[first], pieces.names[second]) if pieces.names else ("", "")
 
 
 def _division_into_two(divisions: list[NamedPieces]) -> NamedPieces | None:
