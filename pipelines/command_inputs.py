@@ -11,6 +11,7 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
+from hoidata.objects.user_mesh import unknown_object_words
 from hoidata.store.info import generated_info
 from hoidata.store.store import open_store, write_store
 from models.common.checkpoints import FILE_NAME, read_info
@@ -51,7 +52,8 @@ def stored_object(name: str, clips: Path, hands: HandPair) -> ObjectModel:
     names = list(store.objects["object"])
     if name not in names:
         expected = f"a mesh file (.obj, .ply, .stl, .glb) or one of: {', '.join(names)}"
-        raise BadInput("--object", expected, name, nearest_name(name, names) or "correct the name or path")
+        remedy = nearest_name(name, names) or "correct the name or path"
+        raise BadInput("--object", expected, unknown_object_words(name), remedy)
     return store.object_model(name)
 
 

@@ -36,6 +36,7 @@ from pipelines.command_inputs import (
     write_motion_store,
 )
 from pipelines.pages.generation_page import write_generation
+from pipelines.pages.motion_files import older_motion_notes
 from pipelines.params import chosen_params, read_file
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
 
@@ -112,7 +113,7 @@ def generate_files(request: GenerationRequest, out: Path, store: Path | None = N
     paths = write_generation(out, motions, hands, str(models.checkpoints), notes)
     clips = [replace(motion.clip, verb=evidence["verb"]) for motion in motions]
     paths += write_motion_store(store, clips, hands, generator.model.facts)
-    return WrittenFiles(paths, notes, verdicts)
+    return WrittenFiles(paths, [*notes, *older_motion_notes(out, paths)], verdicts)
 
 
 def load_generator(profile: str, dataset: str) -> Generator:

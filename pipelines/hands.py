@@ -19,9 +19,16 @@ from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.metrics.unmeasured import Unmeasured
 from hoidata.metrics.verdict import UNKNOWN_UP, fewest_failed, verdict, verdict_lines
 from hoidata.object_paths import keyframed_path, read_keyframes
-from hoidata.object_paths.path import MAX_S, PathStep, check_pace, joint_range_words
+from hoidata.object_paths.path import (
+    MAX_S,
+    PathStep,
+    check_joint_kind,
+    check_joint_range,
+    check_pace,
+    joint_range_words,
+)
 from hoidata.objects.model import ObjectModel
-from hoidata.objects.user_mesh import is_object_path, read_user_object
+from hoidata.objects.user_mesh import is_object_path, read_user_object, unknown_object_words
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import Store, open_store, stored_hinge
 from models.bimart.family import BIMART, BimArtSampler
@@ -42,7 +49,7 @@ from pipelines.command_inputs import (
     write_motion_store,
 )
 from pipelines.pages.hands_page import write_hands
-from pipelines.pages.motion_files import hand_shapes
+from pipelines.pages.motion_files import hand_shapes, older_motion_notes
 from pipelines.show_pages import dataset_of_clip
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
 
@@ -113,6 +120,7 @@ def hands_files(
         names = {"dataset": info["dataset"], "verb": motion.verb}
         clips = [replace(clip, clip_id=f"{options.clip}~{number}", **names) for number, clip in enumerate(clips)]
     written = [*written, *write_motion_store(store, clips, project.hands, networks, **info)]
+    notes = [*notes, *older_motion_notes(out, written)]
     lines = [verdict_lines(sample.number, one) for sample, one in zip(samples, checks, strict=True)]
     return WrittenFiles(written, notes, list(chain.from_iterable(lines)))
 
@@ -126,6 +134,9 @@ def object_motion(options: HandsOptions, project: ProjectData) -> ObjectMotion:
     if len(sources) != 1:
         got = " and ".join(f"--{name}" for name in sources) or "none"
         raise BadInput("object's motion", "one of --keyframes, --clip or --motion", got, "give one of them")
+    if options.keep is not None and options.keep > options.samples:
+        remedy = "raise --samples or lower --keep"
+        raise BadInput("--keep", f"at most --samples {options.samples}", f"{options.keep}", remedy)
     select = {"keyframes": _keyframed_motion, "clip": _clip_motion, "motion": _generated_motion}[sources[0]]
     motion = select(options, project, HandSamplingOptions(options.seed, options.samples, options.hand))
     if options.length_s is not None:
@@ -196,7 +207,7 @@ def _object(options: HandsOptions, project: ProjectData) -> _MovableObject:
     names = sorted({name for store in stores for name in store.objects["object"]})
     expected = "a mesh file (.obj, .ply, .stl, .glb)" + (f" or one of: {', '.join(names)}" if names else "")
     remedy = nearest_name(options.object, names) or ("correct the name or path" if names else "correct the path")
-    raise BadInput("object", expected, options.object, remedy)
+    raise BadInput("object", expected, unknown_object_words(options.object), remedy)
 
 
 def _recorded_object(store: Store, name: str, limits_rad: tuple[float, float] | None) -> _MovableObject:
@@ -249,6 +260,8 @@ def _clip_motion(options: HandsOptions, project: ProjectData, wish: HandSampling
         raise BadInput("object", "no object with --clip, which has one", options.object, "omit it")
     paths = dataset_of_clip(options.clip, project.profile, list(project.datasets))
     clip = open_store(paths.clips, project.hands).clip(options.clip)
+    track, limits_rad = clip.object, hinge_range(options.hinge_range, clip.object.model)
+    check_joint_range(track.model, track.hinge_rad, limits_rad, options.clip)
     betas, template_m = hand_shapes(clip)
     notes = [] if clip.gravity is not None else ["up: z, assumed: the gravity of this clip is not known"]
     gravity = wish.gravity if clip.gravity is None else np.asarray(clip.gravity, np.float64)
@@ -265,13 +278,20 @@ def _generated_motion(options: HandsOptions, project: ProjectData, wish: HandSam
     missing = [name for name in GENERATED_ARRAYS if name not in arrays]
     if missing:
         raise BadInput(path, "a motion.npz of `hoidata generate`", f"no {missing[0]}", "give one, or --keyframes")
-    model, *_, notes = _object(options, project) if options.object else (_mesh_of(arrays, path), list[str]())
+    model, limits, _, notes = (
+        _object(options, project) if options.object else _MovableObject(_mesh_of(arrays, path), None, None, [])
+    )
+    if not is_object_path(options.object):  # a generated motion may leave the range of the recordings
+        limits = hinge_range(options.hinge_range, model)
     hinge_rad = arrays.get("object_hinge_rad")
     if model.is_articulated != (hinge_rad is not None):
         remedy = "give the same object as `hoidata generate` had, with its hinge"
         raise BadInput(path, "an object with a hinge if the motion has one", model.name, remedy)
+    if "object_hinge_axis" in arrays:  # files of older releases do not say whether the joint slides
+        check_joint_kind(model, "object_hinge_origin_m" not in arrays, path)
     track = ObjectTrack(model, arrays["object_rotvec"], arrays["object_translation_m"], hinge_rad)
     _check_track(track, path)
+    check_joint_range(model, hinge_rad, limits, path)
     gravity = arrays.get("gravity", np.zeros(0))
     wish = replace(wish, gravity=np.asarray(gravity, np.float64) if gravity.shape == (3,) else wish.gravity)
     return ObjectMotion(track, wish, f"generated for {str(arrays.get('text', path.name))!r}", notes)

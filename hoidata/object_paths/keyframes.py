@@ -125,7 +125,9 @@ def _check_joint(model: ObjectModel, keys: Keyframes, source: str) -> None:
     if keys.hinge_rad is None or not keys.hinge_rad.any():
         return
     if model.hinge is None:
-        remedy = 'give the hinge (--hinge "px,py,pz dx,dy,dz"), or remove the column'
+        remedy = (
+            'give the hinge (a mesh file: --hinge "px,py,pz dx,dy,dz"; a URDF: a movable joint), or remove the column'
+        )
         raise BadInput(source, f"no hinge angle: {model.name!r} is rigid", "a column hinge_...", remedy)
     if model.hinge.is_prismatic != keys.is_slide:
         columns = ("hinge_deg", "slide_cm")

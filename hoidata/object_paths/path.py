@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -104,36 +105,72 @@ def checked_path(
     hinge = hinge_rad.astype(np.float32) if model.is_articulated else None
     track = ObjectTrack(model, rotmat_to_rotvec(rotmats).astype(np.float32), translation, hinge)
     path = ObjectPath(track, tuple(steps), limits_rad)
-    _check_angle(path, hinge_rad)
+    check_joint_range(model, hinge_rad, limits_rad or _any_range(model), "object path", steps)
     _check_rates(path, shift_m, rotmats, hinge_rad)
     _check_table(path, translation.astype(np.float64), rotmats)
     return path
 
 
-def _step_at(path: ObjectPath, frame: int) -> str:
+def _step_at(steps: Sequence[PathStep], frame: int) -> str:
     """Time of a frame and the steps it belongs to, for messages."""
-    steps = [step.words for step in _steps_at(path, frame)]
-    return f"{frame / FPS:.2f} s" + (f" ({'; '.join(steps)})" if steps else "")
+    words = [step.words for step in _steps_at(steps, frame)]
+    return f"{frame / FPS:.2f} s" + (f" ({'; '.join(words)})" if words else "")
 
 
-def _steps_at(path: ObjectPath, frame: int) -> list[PathStep]:
-    return [step for step in path.steps if step.start_s - 1e-6 <= frame / FPS <= step.end_s + 1e-6]
+def _steps_at(steps: Sequence[PathStep], frame: int) -> list[PathStep]:
+    return [step for step in steps if step.start_s - 1e-6 <= frame / FPS <= step.end_s + 1e-6]
 
 
-def _check_angle(path: ObjectPath, hinge_rad: np.ndarray) -> None:
-    slides = path.track.model.hinge is not None and path.track.model.hinge.is_prismatic
-    low, high = path.limits_rad or (ANY_SLIDE_M if slides else ANY_HINGE_RAD)
-    tolerance = SLIDE_TOLERANCE_M if slides else ANGLE_TOLERANCE_RAD
-    beyond = np.maximum(hinge_rad - high, low - hinge_rad)
-    frame = int(beyond.argmax())
-    if beyond[frame] > tolerance:
-        expected = f"{'a slide' if slides else 'a hinge angle'} of {joint_range_words((low, high), slides)}"
-        first = int((beyond > tolerance).argmax())
-        position = f"{100 * hinge_rad[frame]:.1f} cm" if slides else f"{np.degrees(hinge_rad[frame]):.0f} deg"
-        got = f"{position}, from {_step_at(path, first)} on"
-        raise BadInput(
-            "object path", expected, got, "choose an angle within, or give the hinge's range (--hinge-range)"
-        )
+def check_joint_kind(model: ObjectModel, is_slide: bool, where: str | Path) -> None:
+    """Raise BadInput if a motion of a slide is for an object that turns, or the other way round.
+
+    where: the motion, for the message.
+    """
+    if model.hinge is None or model.hinge.is_prismatic == is_slide:
+        return
+    kinds = ("a hinge angle in radians", "a slide in metres")
+    verb, column = ("slides", "slide_cm") if model.hinge.is_prismatic else ("turns", "hinge_deg")
+    expected = f"{kinds[model.hinge.is_prismatic]}: {model.name!r} {verb}"
+    remedy = f"give the object of this motion, or --keyframes with a column {column}"
+    raise BadInput(where, expected, kinds[is_slide], remedy)
+
+
+def check_joint_range(
+    model: ObjectModel,
+    hinge_rad: np.ndarray | None,
+    limits_rad: tuple[float, float] | None,
+    where: str | Path,
+    steps: Sequence[PathStep] = (),
+) -> None:
+    """Raise BadInput if a joint leaves its limits; nothing is checked if positions or limits are None.
+
+    Args:
+        hinge_rad: (frame,) joint positions, radians or metres.
+        limits_rad: smallest and largest joint position.
+        where: the motion, for the message.
+        steps: time intervals, for the message.
+    """
+    if hinge_rad is None or limits_rad is None or not len(hinge_rad):
+        return
+    slides = model.hinge is not None and model.hinge.is_prismatic
+    beyond = np.maximum(hinge_rad - limits_rad[1], limits_rad[0] - hinge_rad)
+    outside, frame = beyond > (SLIDE_TOLERANCE_M if slides else ANGLE_TOLERANCE_RAD), int(beyond.argmax())
+    if not outside.any():
+        return
+    expected = f"{'a slide' if slides else 'a hinge angle'} of {joint_range_words(limits_rad, slides)}"
+    if model.hinge is not None and (rest := model.hinge.file_position):
+        expected += f", counted from the URDF's limit of {_position_words(rest, slides)}, where the mesh rests"
+    got = f"{_position_words(hinge_rad[frame], slides)}, from {_step_at(steps, int(outside.argmax()))} on"
+    raise BadInput(where, expected, got, "keep the joint within, or give its range (--hinge-range)")
+
+
+def _any_range(model: ObjectModel) -> tuple[float, float]:
+    """The limits of a joint without known limits."""
+    return ANY_SLIDE_M if model.hinge is not None and model.hinge.is_prismatic else ANY_HINGE_RAD
+
+
+def _position_words(position: float, slides: bool) -> str:
+    return f"{100 * position:.1f} cm" if slides else f"{np.degrees(position):.0f} deg"
 
 
 def joint_range_words(limits: tuple[float, float], slides: bool) -> str:
@@ -168,12 +205,13 @@ def _check_rates(path: ObjectPath, shift_m: np.ndarray, rotmats: np.ndarray, hin
     for rate in rates:
         frame = int(rate.size.argmax())
         if rate.size[frame] > rate.limit:
-            steps = _steps_at(path, frame) or [PathStep("it", 0.0, (len(shift_m) - 1) / FPS)]
+            steps = _steps_at(path.steps, frame) or [PathStep("it", 0.0, (len(shift_m) - 1) / FPS)]
             longest = max(steps, key=lambda step: step.end_s - step.start_s)
             frames = slice(math.floor(longest.start_s * FPS), math.ceil(longest.end_s * FPS) + 1)
             factor = max(other.slowdown(frames) for other in rates)
             remedy = _slower(longest, factor * (longest.end_s - longest.start_s))
-            raise BadInput("object path", rate.expected, f"{rate.size[frame]:.3g} at {_step_at(path, frame)}", remedy)
+            got = f"{rate.size[frame]:.3g} at {_step_at(path.steps, frame)}"
+            raise BadInput("object path", rate.expected, got, remedy)
 
 
 def check_pace(track: ObjectTrack, pace: float, source: str) -> None:
@@ -244,7 +282,7 @@ def _check_table(path: ObjectPath, translation_m: np.ndarray, rotmats: np.ndarra
     frame = int(height.argmin())
     if height[frame] < -TABLE_TOLERANCE_M:
         first = int((height < -TABLE_TOLERANCE_M).argmax())
-        got = f"{-height[frame] * 100:.1f} cm under it, from {_step_at(path, first)} on"
+        got = f"{-height[frame] * 100:.1f} cm under it, from {_step_at(path.steps, first)} on"
         remedy = f"lift it by {np.ceil(-height[frame] * 100):.0f} cm more before, or lower it less"
         raise BadInput("object path", "an object above the table", got, remedy)
 

@@ -39,6 +39,7 @@ class Glb(NamedTuple):
     node: np.ndarray  # (face,) index of the face's node
     branch: np.ndarray  # (face,) index of the root node of the face's branch, below the first fork of the scene's tree
     names: list[str]  # of all nodes
+    parents: list[int]  # of all nodes; -1 for roots
 
 
 def parse_glb(data: bytes, path: str | Path) -> Glb:
@@ -143,7 +144,8 @@ class _Scene:
             np.array(numbers, dtype=np.int64)
             for numbers in (showing, [branch[number] for number in showing], [len(mesh.faces) for mesh in meshes])
         )
-        return Glb(*joined(meshes), node=nodes.repeat(times), branch=branches.repeat(times), names=names)
+        parents = [-1 if (parent := self.parent.get(number)) is None else parent for number in range(len(self.nodes))]
+        return Glb(*joined(meshes), nodes.repeat(times), branches.repeat(times), names, parents)
 
     def _spend(self, corners: int) -> None:
         self.budget -= corners

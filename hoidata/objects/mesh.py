@@ -37,6 +37,7 @@ class NamedPieces(NamedTuple):
     kind: str  # what the pieces are: "objects", "groups", ...
     names: list[str]  # of the pieces; empty for pieces without names
     of_face: np.ndarray  # (face,) index of each face's piece
+    parents: Sequence[int] = ()  # by piece, the piece with which it moves, or -1; empty if none does
 
 
 class MassProperties(NamedTuple):

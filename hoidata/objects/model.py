@@ -27,6 +27,7 @@ class Hinge:
     axis: np.ndarray  # (3,) unit vector, object frame
     origin_m: np.ndarray  # (3,) a point on the axis, object frame; zeros for a prismatic joint
     is_prismatic: bool = False
+    file_position: float = 0.0  # of the URDF's joint where the mesh rests, which counts as 0; radians or metres
 
     @property
     def unit(self) -> str:
@@ -37,6 +38,11 @@ class Hinge:
     def arrays(self) -> tuple[np.ndarray, ...]:
         """Axis, and origin of a revolute joint: the stored arrays, from which digests are computed."""
         return (self.axis,) if self.is_prismatic else (self.axis, self.origin_m)
+
+    def scaled(self, factor: float) -> "Hinge":
+        """The joint of the object scaled about the origin of its frame."""
+        file_position = self.file_position * (factor if self.is_prismatic else 1.0)
+        return replace(self, origin_m=factor * self.origin_m, file_position=file_position)
 
     def turn(self, hinge_rad: np.ndarray) -> RigidTransform:
         """``object_from_part`` of the moving part at joint positions (frame,), radians; metres if prismatic."""
@@ -85,7 +91,7 @@ class ObjectModel:
 
     def scaled(self, factor: float) -> "ObjectModel":
         """The object, scaled about the origin of its frame."""
-        hinge = self.hinge and replace(self.hinge, origin_m=factor * self.hinge.origin_m)
+        hinge = self.hinge and self.hinge.scaled(factor)
         return replace(self, vertices_m=factor * self.vertices_m, hinge=hinge)
 
     @property

@@ -17,11 +17,13 @@ from scipy.spatial.transform import Rotation
 from trimesh.creation import box, cylinder, icosphere
 
 from hoidata.errors import BadInput
+from hoidata.objects.joint_checks import check_limits
 from hoidata.objects.mesh import LARGEST_MESH_BYTES, Mesh, joined
 from hoidata.objects.model import Hinge
 from hoidata.objects.ply import MOST_TRIANGLES
 
 SUFFIX, PARTNET_NAME = ".urdf", "mobility.urdf"
+_XACRO_SUFFIX, _EXPAND = ".xacro", "xacro FILE.urdf.xacro > FILE.urdf"
 _MAX_BYTES, _MAX_ELEMENTS = 4 << 20, 2000  # of the file; of its links, joints and meshes each
 _MOVABLE, _FIXED = ("revolute", "continuous", "prismatic"), ("fixed",)
 
@@ -54,13 +56,21 @@ class UrdfObject(NamedTuple):
 def find_urdf(path: Path) -> Path | None:
     """The URDF file of a path: the file itself, or the one in a folder or in its subfolder ``urdf``; None without one.
 
-    Raises BadInput for a folder with several, of which none is mobility.urdf.
+    Raises BadInput for a folder with several, of which none is mobility.urdf, and for a xacro file.
     """
+    if path.suffix.lower() == _XACRO_SUFFIX and path.is_file():
+        raise BadInput(path, "a URDF file", "a xacro file", f"expand it with xacro first: {_EXPAND}")
     if path.suffix.lower() == SUFFIX and path.is_file():
         return path
     if not path.is_dir():
         return None
-    files = sorted(item for folder in (path, path / "urdf") for item in folder.glob(f"*{SUFFIX}") if item.is_file())
+    names = [name for folder in (path, path / "urdf") for name in folder.glob("*")]
+    files, xacro = (
+        sorted(name for name in names if name.suffix.lower() == suffix and name.is_file())
+        for suffix in (SUFFIX, _XACRO_SUFFIX)
+    )
+    if xacro and not files:
+        return find_urdf(xacro[0])
     if len(files) > 1 and files[0].with_name(PARTNET_NAME) not in files:
         raise BadInput(path, "one URDF file", ", ".join(item.name for item in files[:5]), "name the file instead")
     return next((item for item in files if item.name == PARTNET_NAME), files[0] if files else None)
@@ -89,7 +99,8 @@ def read_urdf(path: Path, root: Path, moving: str, read_mesh: ReadMesh) -> UrdfO
             collision += [name] if pieces[name] else []
     behind = {joint.name: _links_behind(joint, joints) for joint in joints if joint.kind in _MOVABLE}
     movable = [joint for joint in joints if any(pieces[link] for link in behind.get(joint.name, ()))]
-    chosen = _chosen_joint(path, movable, moving)
+    bare = [joint for joint in joints if joint.name in behind and joint not in movable]
+    chosen = _chosen_joint(path, movable, bare, moving)
     notes = [f"no visual mesh, so collision meshes count: {', '.join(collision[:5])}"] if collision else []
     notes += _joint_notes(movable, chosen)
     moves = behind[chosen.name] if chosen else set()
@@ -101,8 +112,11 @@ def read_urdf(path: Path, root: Path, moving: str, read_mesh: ReadMesh) -> UrdfO
     part = np.repeat(np.array([0, 1], np.uint8), [len(mesh.vertices) for mesh in parts])
     if chosen is None:
         return UrdfObject(parts[0], part, None, None, notes)
-    hinge, limits, rest = _hinge(chosen, poses[chosen.child])
-    moved_m = (hinge.turn(np.array([rest])) @ parts[1].vertices[None])[0]
+    if chosen.limits:
+        diagonal = float(np.linalg.norm(np.ptp(joined(parts).vertices, axis=0)))
+        check_limits(f"{path}: joint {chosen.name!r}", chosen.kind == "prismatic", chosen.limits, diagonal)
+    hinge, limits = _hinge(chosen, poses[chosen.child])
+    moved_m = (hinge.turn(np.array([hinge.file_position])) @ parts[1].vertices[None])[0]
     mesh = joined([parts[0], Mesh(moved_m, parts[1].faces)])
     return UrdfObject(mesh, part, hinge, limits, notes)
 
@@ -118,8 +132,10 @@ def _parse(path: Path) -> Element:
     except (ElementTree.ParseError, UnicodeDecodeError, ValueError) as error:
         raise BadInput(path, "a URDF file, XML in UTF-8", str(error)[:200], "export it again") from error
     if robot.tag != "robot":
-        remedy = "expand it: xacro FILE > FILE.urdf" if "xacro" in text else "give a URDF file"
+        remedy = f"expand it with xacro first: {_EXPAND}" if "xacro" in text else "give a URDF file"
         raise BadInput(path, "a URDF file, whose root element is robot", str(robot.tag)[:60], remedy)
+    if any("xacro" in element.tag or "${" in "".join(element.attrib.values()) for element in robot.iter()):
+        raise BadInput(path, "a URDF file", "macros of xacro", f"expand it with xacro first: {_EXPAND}")
     return robot
 
 
@@ -213,11 +229,19 @@ def _links_behind(joint: Joint, joints: list[Joint]) -> set[str]:
     return behind
 
 
-def _chosen_joint(path: Path, movable: list[Joint], moving: str) -> Joint | None:
+def _chosen_joint(path: Path, movable: list[Joint], bare: list[Joint], moving: str) -> Joint | None:
+    """The joint that moves, or None if all are fixed. ``bare``: joints that move no mesh, for the message."""
     named = [joint for joint in movable if joint.name == moving]
-    if named or (len(movable) < 2 and not moving):
-        return (named or movable or [None])[0]
-    listed = ", ".join(f"{joint.name} ({joint.kind})" for joint in movable[:20]) or "none"
+    if named or (len(movable) == 1 and not moving):
+        return (named or movable)[0]
+    if not movable and not bare and not moving:
+        return None
+    if bare and not movable and not moving:
+        where, expected = f"{path}: joint {bare[0].name!r}", f"a mesh in its link {bare[0].child!r}"
+        raise BadInput(where, expected, "none", "add a visual or collision mesh; or make the joint fixed")
+    names = [f"{joint.name} ({joint.kind})" for joint in movable]
+    names += [f"{joint.name} (its link {joint.child} has no mesh)" for joint in bare]
+    listed = ", ".join(names[:20]) or "none"
     expected = "the name of a movable joint" if moving else "one movable joint"
     remedy = "--moving NAME chooses the joint that moves; the others stay at rest"
     raise BadInput(path, expected, f"{moving!r}; there are: {listed}" if moving else listed, remedy)
@@ -233,15 +257,13 @@ def _joint_notes(movable: list[Joint], chosen: Joint | None) -> list[str]:
     return notes
 
 
-def _hinge(joint: Joint, root_from_child: np.ndarray) -> tuple[Hinge, tuple[float, float] | None, float]:
-    """Joint in the root's frame, its limits relative to its position at rest, and that position."""
+def _hinge(joint: Joint, root_from_child: np.ndarray) -> tuple[Hinge, tuple[float, float] | None]:
+    """Joint in the root's frame, and its limits relative to its position at rest, the permitted one nearest to zero."""
     axis = root_from_child[:3, :3] @ joint.axis
     is_prismatic = joint.kind == "prismatic"
-    hinge = Hinge(axis, np.zeros(3) if is_prismatic else root_from_child[:3, 3], is_prismatic)
-    if joint.limits is None:
-        return hinge, None, 0.0
-    rest = min(max(0.0, joint.limits[0]), joint.limits[1])
-    return hinge, (joint.limits[0] - rest, joint.limits[1] - rest), rest
+    rest = 0.0 if joint.limits is None else min(max(0.0, joint.limits[0]), joint.limits[1])
+    hinge = Hinge(axis, np.zeros(3) if is_prismatic else root_from_child[:3, 3], is_prismatic, rest)
+    return hinge, joint.limits and (joint.limits[0] - rest, joint.limits[1] - rest)
 
 
 def _geometries(link: Element, tag: str) -> Iterator[Element]:

@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 from hoidata.errors import BadInput
 from hoidata.geometry.rows import distinct_rows
 from hoidata.objects.glb import Glb, parse_glb
+from hoidata.objects.joint_checks import check_axis_is_near
 from hoidata.objects.mesh import Mesh, NamedPieces, checked_mesh, load_named_mesh, read_mesh_bytes
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.stl import parse_stl
@@ -48,6 +49,11 @@ def is_object_path(name: str) -> bool:
     return isfile(name) or (isdir(name) and find_urdf(Path(name)) is not None)
 
 
+def unknown_object_words(name: str) -> str:
+    """The name, and that it is a folder without a URDF file if it is; for messages on an unknown object."""
+    return f"{name}, a folder without a .urdf file" if isdir(name) else name
+
+
 def read_user_object(
     path: Path, unit: str = "", up: str = "", hinge: str = "", moving: str = "", factor: float = 1.0
 ) -> UserObject:
@@ -70,6 +76,8 @@ def read_user_object(
     body = _body(path, hinge, moving)
     mesh, notes = body.mesh, list(body.notes)
     scale = _scale(path, mesh, unit, factor)
+    if hinge and body.hinge:
+        check_axis_is_near(mesh.vertices, body.hinge, unit or "m", UNITS_M)
     vertices = mesh.vertices * scale
     if not up:
         up, note = _usual_up(path) or guess_up(vertices)
@@ -79,7 +87,8 @@ def read_user_object(
     upright_from_file = _upright_from_file(UP_AXES[up])
     joint, limits = body.hinge, body.limits
     if joint:
-        joint = replace(joint, axis=upright_from_file @ joint.axis, origin_m=upright_from_file @ joint.origin_m * scale)
+        joint = joint.scaled(scale)
+        joint = replace(joint, axis=upright_from_file @ joint.axis, origin_m=upright_from_file @ joint.origin_m)
     if joint and joint.is_prismatic and limits:
         limits = (limits[0] * scale, limits[1] * scale)
     stem = path.resolve().parent.name if path.name == PARTNET_NAME else path.stem
@@ -108,7 +117,13 @@ def _body(path: Path, hinge: str, moving: str) -> UrdfObject:
         path, file, [name.strip() for name in moving.split(",") if name.strip()]
     )
     verb = "slides" if joint.is_prismatic else "turns about the hinge"
-    return UrdfObject(mesh, part, joint, None, [f"{moves!r} {verb}, {stays!r} stays"] if stays and moves else [])
+    if stays and moves:
+        return UrdfObject(mesh, part, joint, None, [f"{moves!r} {verb}, {stays!r} stays"])
+    moving_vertices = mesh.vertices[part == 1]
+    middle = (moving_vertices.min(axis=0) + moving_vertices.max(axis=0)) / 2
+    centre = ", ".join(f"{value:.3g}" for value in np.round(middle, 6) + 0.0)  # no "-0"
+    note = f"the second of two pieces without names of their own, with its centre at {centre} in the file, {verb}"
+    return UrdfObject(mesh, part, joint, None, [note])
 
 
 def _usual_up(path: Path) -> tuple[str, str] | None:
@@ -202,7 +217,8 @@ def _of_stl(path: Path, data: bytes) -> tuple[Mesh, list[NamedPieces]]:
 
 def _of_glb(glb: Glb) -> tuple[Mesh, list[NamedPieces]]:
     mesh = Mesh(glb.vertices, glb.faces)
-    return mesh, [NamedPieces("nodes", glb.names, glb.node), NamedPieces("branches of nodes", glb.names, glb.branch)]
+    divisions = {"nodes": glb.node, "branches of nodes": glb.branch}
+    return mesh, [NamedPieces(kind, glb.names, of_face, glb.parents) for kind, of_face in divisions.items()]
 
 
 def _joined(file: _MeshFile) -> Mesh:
@@ -242,12 +258,12 @@ def _in_two_pieces(path: Path, file: _MeshFile, moving: Sequence[str]) -> tuple[
 def _named_as_moving(path: Path, file: _MeshFile, moving: Sequence[str]) -> NamedPieces:
     """The division into the named pieces, which move, and all others. Raises BadInput that lists the names."""
     for pieces in file.pieces:
-        present = {pieces.names[number]: number for number in _order(pieces)} if pieces.names else {}
-        numbers = [present[name] for name in moving if name in present]
-        if len(numbers) == len(moving) and len(numbers) < len(present):
+        names_of = {number: _names_upwards(pieces, number) for number in _order(pieces)} if pieces.names else {}
+        numbers = [number for number, names in names_of.items() if set(names) & set(moving)]
+        if set(moving) <= {name for names in names_of.values() for name in names} and len(numbers) < len(names_of):
             moves = np.isin(pieces.of_face, numbers)
-            others = [name for name in present if name not in moving]
-            names = [", ".join(others), ", ".join(moving)]
+            others = [names_of[number][0] for number in names_of if number not in numbers]
+            names = [", ".join(others), ", ".join(names_of[number][0] for number in numbers)]
             return NamedPieces(pieces.kind, names, moves.astype(np.int64))
     listed = "; ".join(
         f"{pieces.kind}: {', '.join(pieces.names[number] for number in _order(pieces)[:20])}"
@@ -260,6 +276,14 @@ def _named_as_moving(path: Path, file: _MeshFile, moving: Sequence[str]) -> Name
         f"{', '.join(moving)}; there are: {listed or 'none'}",
         "name what moves",
     )
+
+
+def _names_upwards(pieces: NamedPieces, number: int) -> list[str]:
+    """The name of a piece, then those of the nodes above it, with which it moves."""
+    names = [pieces.names[number]] if number < len(pieces.names) else [""]
+    while pieces.parents and (number := pieces.parents[number]) >= 0:
+        names.append(pieces.names[number])
+    return names
 
 
 def piece_names(path: Path) -> tuple[str, str] | None:

@@ -339,7 +339,7 @@ def hands(
     keep: Annotated[
         int | None, typer.Option(help="Keep this many samples, those that fail the fewest checks. Default: all.", min=1)
     ] = None,
-    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
+    seed: Seed = 0,
     hand: Annotated[Literal["left", "right", "both"], typer.Option(help="Hands that act.")] = "both",
     length: Annotated[
         float | None, typer.Option(help="Duration in seconds. Default: the duration of the object's motion.")
@@ -384,11 +384,15 @@ def hands(
 
 
 def _absolute(name: str) -> str:
-    """The absolute path of a file or a folder with a URDF, since commands change into the project; else the name."""
+    """The absolute path of a file or folder, since commands change into the project; else the name.
+
+    The name of a dataset's object may also be that of a folder. Such a folder counts if it has a URDF.
+    """
     from hoidata.objects.user_mesh import is_object_path
 
     path = str(Path(name).absolute())
-    return path if name and is_object_path(path) else name
+    is_folder = Path(name).name != name and Path(name).is_dir()
+    return path if name and (is_folder or is_object_path(path)) else name
 
 
 def _project(profile: str) -> tuple[str, tuple[str, ...]]:

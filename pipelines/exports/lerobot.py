@@ -1,7 +1,7 @@
 """LeRobot's dataset layout v3.0 (huggingface/lerobot, docs "LeRobotDataset v3"): an episode per clip, without video.
 
 ``observation.state`` and ``action`` are the 2 x 21 joints of this and of the next frame,
-``observation.environment_state`` the object: position, quaternion xyzw, hinge angle. ``observation.hand_valid`` and
+``observation.environment_state`` the object: position, quaternion xyzw, joint position. ``observation.hand_valid`` and
 ``next.hand_valid`` are the masks of state and action; statistics count only valid values. Tasks are the sentences; a
 frame's task is the clip's first sentence.
 """
@@ -31,7 +31,7 @@ VALID, NEXT_VALID = "observation.hand_valid", "next.hand_valid"
 _OBJECT_NAMES = [*(f"object.{axis}" for axis in "xyz"), *(f"object.q{axis}" for axis in "xyzw"), "object.hinge"]
 _HAND_NAMES = [f"{side}.{joint}.{axis}" for side in SIDES for joint in JOINT_NAMES for axis in "xyz"]
 _NAMES = {STATE: _HAND_NAMES, ACTION: _HAND_NAMES, OBJECT: _OBJECT_NAMES, VALID: list(SIDES), NEXT_VALID: list(SIDES)}
-_POSE = "origin of the object frame, quaternion xyzw of world_from_object, hinge angle from the mesh as stored"
+_POSE = "origin of the object frame, quaternion xyzw of world_from_object, joint position from the mesh as stored"
 _TRACKED = (
     "whether left and right hand are tracked; untracked frames repeat the last tracked pose, or before the first "
     "tracked frame the first; zeros if a hand is never tracked in the clip"
@@ -39,7 +39,7 @@ _TRACKED = (
 COLUMNS = (
     Column(STATE, "float32", (126,), "21 joints of the left, then of the right hand; world frame, metre"),
     Column(ACTION, "float32", (126,), "observation.state of the next frame; the last frame repeats its state"),
-    Column(OBJECT, "float32", (8,), f"{_POSE} (0 for a rigid object); world frame, metre, radian"),
+    Column(OBJECT, "float32", (8,), f"{_POSE}: hinge angle in radian, slide in metre, 0 if rigid; world frame, metre"),
     Column(VALID, "bool", (2,), _TRACKED),
     Column(NEXT_VALID, "bool", (2,), f"{VALID} of the next frame, so of {ACTION}; False in the last frame"),
     Column("timestamp", "float32", (), "since the clip's first frame, second"),

@@ -1,5 +1,6 @@
 """Writes a motion as motion.npz (hands, object, mesh and hinge), motion.glb and a page that plays it."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -88,6 +89,13 @@ def write_motions(
     values |= {"files": [(path.name, words[path.suffix]) for path in paths], "has_players": True}
     values |= {"arrays": [(name, meanings[name]) for name in motion_files[0].arrays]}
     return [*paths, write_page(folder / "index.html", template, synthetic=motion_files[0].clip.synthetic, **values)]
+
+
+def older_motion_notes(folder: Path, written: Sequence[Path]) -> list[str]:
+    """A note that names the motions of an earlier run in a folder, which are none of the ``written`` files."""
+    names = {path.name for path in folder.glob("motion*") if re.fullmatch(r"motion(-\d+)?\.(npz|glb)", path.name)}
+    older = sorted(names - {path.name for path in written})
+    return [f"{folder} also has motions of an earlier run, which stay: {', '.join(older)}"] if older else []
 
 
 def motion_arrays(clip: Clip, hands: HandPair) -> dict[str, np.ndarray]:

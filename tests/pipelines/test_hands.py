@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+from typer.testing import CliRunner
 
 from hoidata.clips.clip import ObjectTrack
 from hoidata.errors import BadInput
@@ -19,10 +20,11 @@ from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from models.bimart.hands import ContactMeasures
+from pipelines.cli import app
 from pipelines.command_inputs import MeshOptions, ProjectData, stored_object
 from pipelines.hands import HandsOptions, ObjectMotion, _untouched_fraction, chosen_networks, hinge_range, object_motion
 from pipelines.pages.hands_page import _measures
-from pipelines.pages.motion_files import mesh_arrays, motion_arrays
+from pipelines.pages.motion_files import mesh_arrays, motion_arrays, older_motion_notes
 from tests.builders.clips import clip_of
 from tests.builders.objects import hinged_box
 from tests.builders.urdf import write_drawer, write_partnet
@@ -161,6 +163,7 @@ def test_the_object_motion_of_a_generated_file_keeps_mesh_and_hinge(tmp_path):
             {"keyframes": "time_s,hinge_deg 0,0 2,100", "mesh": MeshOptions("cm", "z", HINGE), "hinge_range": "0:90"},
             "0 to 90 deg",
         ),
+        ({"keyframes": REST, "samples": 2, "keep": 3}, "--keep: expected at most --samples 2, got 3"),
         ({"keyframes": REST, "length_s": 0.1}, "another length"),
         ({"keyframes": REST, "length_s": float("nan")}, "0.3 to 120 s, got nan"),
         ({"keyframes": REST, "length_s": float("inf")}, "0.3 to 120 s, got inf"),
@@ -209,6 +212,70 @@ def test_the_slide_of_a_motion_file_is_read_back(tmp_path, keys):
     again = selected(motion=str(tmp_path / "motion.npz")).track
     expected_m = track.points_in_world(track.model.vertices_m, track.model.part)
     assert again.points_in_world(again.model.vertices_m, again.model.part) == pytest.approx(expected_m, abs=1e-6)
+
+
+def test_a_motion_of_the_other_kind_of_joint_or_beyond_its_limits_is_refused(tmp_path, keys):
+    drawer, door = str(write_drawer(tmp_path / "d")), str(write_partnet(tmp_path / "4321"))
+    turn = {"object": door, "keyframes": keys("time_s,hinge_deg 0,0 2,30"), "mesh": MeshOptions(moving="joint_0")}
+    for name, options in (("slide", {"object": drawer, "keyframes": keys("time_s,slide_cm 0,0 2,15")}), ("turn", turn)):
+        track = selected(**options).track
+        arrays = motion_arrays(clip_of("a/b/c", track), HANDS) | mesh_arrays(track.model)
+        write_npz(tmp_path / f"{name}.npz", arrays)
+    write_npz(tmp_path / "old.npz", {key: value for key, value in arrays.items() if "hinge_axis" not in key})
+    slide, turn, old = (str(tmp_path / f"{name}.npz") for name in ("slide", "turn", "old"))
+    with pytest.raises(BadInput, match=r"turn\.npz: expected a slide in metres: 'drawer' slides, got a hinge angle"):
+        selected(object=drawer, motion=turn)
+    with pytest.raises(BadInput, match=r"a hinge angle in radians: '4321' turns.*keyframes with a column hinge_deg"):
+        selected(object=door, motion=slide, mesh=MeshOptions(moving="joint_0"))
+    with pytest.raises(
+        BadInput, match=r"old\.npz: expected a slide of 0\.0 to 20\.0 cm, got 52\.4 cm, from 0\.\d+ s on"
+    ):
+        selected(object=drawer, motion=old)  # the file does not say which kind, but leaves the limits
+    with pytest.raises(BadInput, match=r"turn\.npz: expected a hinge angle of 0 to 20 deg, got 30 deg"):
+        selected(motion=turn, hinge_range="0:20")
+    assert selected(motion=turn, hinge_range="0:40").track.n_frames == 61
+    assert selected(object=drawer, motion=slide).track.n_frames == 61
+
+
+def test_a_hinge_range_bounds_the_motion_of_a_clip(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = keyframed_path(hinged_box(), parse_keyframes(b"time_s,z_cm,hinge_deg\n0,0,0\n1,5,45\n", "keys.csv"))
+    clips = [clip_of("arctic/s01/box_use_01/0000-0030", path.track)]
+    write_store(tmp_path / "data/embedded/arctic/clips", clips, generated_info("arctic", HANDS))
+    project = ProjectData("embedded", ("arctic",), HANDS)
+    assert object_motion(HandsOptions(clip=clips[0].clip_id, hinge_range="0:50"), project).track.n_frames == 31
+    with pytest.raises(
+        BadInput, match=r"arctic/s01/box_use_01/0000-0030: expected a hinge angle of 0 to 20 deg, got 45"
+    ):
+        object_motion(HandsOptions(clip=clips[0].clip_id, hinge_range="0:20"), project)
+
+
+def test_a_refusal_says_from_where_positions_count_if_the_limits_of_a_urdf_exclude_zero(tmp_path, keys):
+    drawer = write_drawer(tmp_path / "drawer")
+    drawer.write_text(drawer.read_text().replace('lower="0" upper="0.2"', 'lower="0.05" upper="0.2"'))
+    expected = r"a slide of 0\.0 to 15\.0 cm, counted from the URDF's limit of 5\.0 cm, where the mesh rests, got 18\.0"
+    with pytest.raises(BadInput, match=expected):
+        selected(object=str(drawer), keyframes=keys("time_s,slide_cm 0,0 2,18"))
+
+
+def test_a_folder_without_a_urdf_is_named_so(tmp_path, keys):
+    (tmp_path / "mug").mkdir()
+    with pytest.raises(BadInput, match=r"mug, a folder without a \.urdf file"):
+        selected(object=str(tmp_path / "mug"), keyframes=keys(REST))
+
+
+def test_files_of_an_earlier_run_with_more_samples_are_named(tmp_path):
+    for name in ("motion.npz", "motion.glb", "motion-1.npz", "motion-12.glb", "motion-capture.npz", "index.html"):
+        (tmp_path / name).touch()
+    (note,) = older_motion_notes(tmp_path, [tmp_path / "motion.npz", tmp_path / "motion.glb"])
+    assert note.endswith("motions of an earlier run, which stay: motion-1.npz, motion-12.glb")
+    assert not older_motion_notes(tmp_path, list(tmp_path.iterdir()))
+
+
+def test_a_negative_seed_is_refused_as_in_generate():
+    commands = (["hands", "mug.obj"], ["generate", "Lift a mug.", "--object", "mug.obj"])
+    results = [CliRunner().invoke(app, [*command, "--out", "out", "--seed", "-1"]) for command in commands]
+    assert [("--seed" in result.output, result.exit_code) for result in results] == [(True, 2)] * 2
 
 
 @pytest.mark.parametrize(("distance_m", "expected"), [(0.01, 0.0), (0.05, 1.0)])

@@ -1,5 +1,6 @@
 """Objects of URDF files: parts, joints and limits; files that must not be trusted."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +74,9 @@ def test_a_joint_rests_within_its_limits(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace('lower="0" upper="0.2"', 'lower="0.05" upper="0.2"'))
     user = read_user_object(path)
     assert user.joint_limits == pytest.approx((0, 0.15))
+    assert user.model.hinge.file_position == 0.05
+    assert user.model.scaled(2).hinge.file_position == 0.1
+    assert read_user_object(path, unit="inch").model.hinge.file_position == pytest.approx(0.05 * 0.0254)
     at_zero = read_user_object(write_drawer(tmp_path / "zero")).model
     moving = at_zero.part == 1
     shift = user.model.vertices_m[moving] - at_zero.vertices_m[moving]
@@ -118,6 +122,9 @@ ENTITIES = '<!DOCTYPE r [<!ENTITY a "x"><!ENTITY b "&a;&a;">]>'
         (('axis xyz="1 0 0"', 'axis xyz="0 0 0"'), "an axis with a direction"),
         (('axis xyz="1 0 0"', 'axis xyz="1 nan 0"'), "3 finite numbers, got 1 nan 0"),
         (('lower="0"', 'lower="0.3"'), "a lower limit below the upper one"),
+        (('upper="0.2"', 'upper="90"'), "they look like another unit: write that of the meshes"),
+        (('lower="0"', 'lower="-1e30"'), 'if the joint has no stop, remove the element "limit"'),
+        (('size="0.01', 'size="${w} 0.01'), "macros of xacro; expand it with xacro first"),
         (("<box size", "<capsule size"), "a mesh, box, cylinder or sphere, got capsule"),
         (('size="0.01', 'size="-0.01'), "above 0"),
         (("tray.obj", "none.obj"), "no such file"),
@@ -175,3 +182,48 @@ def test_a_folder_counts_as_an_object_only_with_a_urdf(tmp_path: Path) -> None:
     (tmp_path / "two" / "other.urdf").write_text("<robot/>")
     with pytest.raises(BadInput, match=r"drawer\.urdf, other\.urdf"):
         find_urdf(tmp_path / "two")
+
+
+@pytest.mark.parametrize(
+    ("upper", "remedy"),
+    [
+        (
+            "120",
+            "they look like degrees: write radians, 0 and 2.094; if the joint has no stop, make its type continuous",
+        ),
+        ("1e30", "got 0 and 1e\\+30; if the joint has no stop, make its type continuous"),
+    ],
+)
+def test_limits_of_a_hinge_beyond_two_turns_are_refused(upper: str, remedy: str, tmp_path: Path) -> None:
+    path = write_laptop(tmp_path)
+    for limit in ("12.5", upper):
+        path.write_text(re.sub('upper="[^"]*"', f'upper="{limit}"', path.read_text()))
+        if limit == "12.5":
+            assert read_user_object(path).joint_limits == (0.0, 12.5)
+    with pytest.raises(BadInput, match=f"limits of at most 4 pi rad, two turns, .*{remedy}"):
+        read_user_object(path)
+
+
+def test_a_joint_whose_link_has_no_mesh_is_named(tmp_path: Path) -> None:
+    path = write_drawer(tmp_path)
+    link = path.read_text().partition('<link name="tray">')[2].partition("</link>")[0]
+    path.write_text(path.read_text().replace(link, ""))
+    with pytest.raises(BadInput, match=r"joint 'slide': expected a mesh in its link 'tray', got none; add .* or make"):
+        read_user_object(path)
+    with pytest.raises(BadInput, match=r"'slide'; there are: slide \(its link tray has no mesh\)"):
+        read_user_object(path, moving="slide")
+    path.write_text(path.read_text().replace("prismatic", "fixed"))
+    assert not read_user_object(path).model.is_articulated
+    assert "the URDF has no movable joint: the object is rigid" in read_user_object(path).notes
+
+
+def test_a_suffix_in_capitals_is_found_and_a_xacro_file_must_be_expanded(tmp_path: Path) -> None:
+    path = write_drawer(tmp_path / "drawer")
+    path.rename(path.with_name("R.URDF"))
+    assert is_object_path(str(tmp_path / "drawer"))
+    assert read_user_object(tmp_path / "drawer").model.is_articulated
+    xacro = path.with_name("drawer.urdf.xacro")
+    path.with_name("R.URDF").rename(xacro)
+    for name in (xacro, tmp_path / "drawer"):
+        with pytest.raises(BadInput, match=r"drawer\.urdf\.xacro: .*expand it with xacro first: xacro FILE"):
+            read_user_object(name)

@@ -130,6 +130,30 @@ def test_a_hinge_needs_two_pieces(tmp_path):
         read_user_object(saved(MUG, tmp_path / "mug.obj"), hinge="0,0,0 1,0,0")
 
 
+@pytest.mark.parametrize(
+    ("hinge", "unit", "remedy"),
+    [
+        ("0,7.5,2 -1,0,0", "", "in the mesh's unit (m); if it is in cm, write 0,0.075,0.02"),
+        ("0,75,20 -1,0,0", "m", "if it is in mm, write 0,0.075,0.02"),
+        ("0,75,20 -1,0,0", "cm", "in the mesh's unit (cm); if it is in mm, write 0,7.5,2"),
+        ("0,1e9,0 -1,0,0", "", "in the mesh's unit (m)"),
+        ("0,0.5,0 -1,0,0", "", ""),  # 42 cm from a mesh of 26 cm
+        ("0,0.3,0 -1,0,0", "", None),
+        ("9,0.075,0.02 -1,0,0", "", None),  # any point on the axis
+    ],
+)
+def test_an_axis_far_from_the_mesh_is_refused_with_the_unit_that_fits(tmp_path, hinge, unit, remedy):
+    base, lid = trimesh.creation.box((0.2, 0.15, 0.04)), trimesh.creation.box((0.2, 0.15, 0.02))
+    lid.apply_translation([0, 0, 0.031])
+    path = saved(trimesh.util.concatenate([base, lid]), tmp_path / "box.obj", scale=100 if unit == "cm" else 1)
+    if remedy is None:
+        assert read_user_object(path, unit=unit, up="z", hinge=hinge).model.is_articulated
+        return
+    with pytest.raises(BadInput, match=r"--hinge: expected an axis within (0\.257 m|25\.7 cm)") as error:
+        read_user_object(path, unit=unit, up="z", hinge=hinge)
+    assert remedy in str(error.value)
+
+
 def pieces_of_boxes(*corners_m):
     """Boxes of 2 cm at these corners, in one mesh."""
     boxes = [trimesh.creation.box((0.02, 0.02, 0.02)).apply_translation(corner) for corner in corners_m]
@@ -197,6 +221,22 @@ def test_a_lid_of_several_nodes_under_one_node_is_a_part(tmp_path):
     assert parts_of(tmp_path / "box.glb") == TWO_PARTS
 
 
+def test_the_children_of_a_node_move_with_it_at_any_depth(tmp_path):
+    scene, (plate, knob) = trimesh.Scene(), LID.split()
+    scene.add_geometry(BODY, "body", "body")
+    scene.add_geometry(plate, "lid", "lid", parent_node_name="body")
+    scene.graph.update("stem", "lid")  # a node without a mesh
+    scene.add_geometry(knob, "knob", "knob", parent_node_name="stem")
+    scene.export(tmp_path / "box.glb")
+    user = read_user_object(tmp_path / "box.glb", up="z", hinge="0,-0.1,0.04 1,0,0", moving="lid")
+    assert user.notes[0] == "'lid, knob' turns about the hinge, 'body' stays"
+    assert user.model.vertices_m[user.model.part == 1, 2].max() == pytest.approx(0.11)
+    knob_moves = read_user_object(tmp_path / "box.glb", up="z", hinge="0,-0.1,0.04 1,0,0", moving="stem")
+    assert knob_moves.notes[0] == "'knob' turns about the hinge, 'body, lid' stays"
+    with pytest.raises(BadInput, match="names of some pieces"):  # nothing would stay
+        read_user_object(tmp_path / "box.glb", up="z", hinge="0,-0.1,0.04 1,0,0", moving="body")
+
+
 def test_pieces_that_share_vertices_are_cut_apart_where_their_names_change(tmp_path):
     """A cover that is one surface with its back: each part gets separate vertices along the fold."""
     corners = "v 0 0 0\nv 0.1 0 0\nv 0.1 0.1 0\nv 0 0.1 0\nv 0.1 0.2 0.01\nv 0 0.2 0.01\n"
@@ -210,6 +250,9 @@ def test_the_names_of_moving_and_fixed_piece_are_reported(tmp_path):
     (tmp_path / "box.obj").write_text(obj_text())
     notes = read_user_object(tmp_path / "box.obj", up="z", hinge="0,-0.1,0.04 1,0,0").notes
     assert "'lid' turns about the hinge, 'body' stays" in notes
+    two = saved(pieces_of_boxes([0, 0, 0], [0, 0, 0.03]), tmp_path / "two.ply")
+    note = "the second of two pieces without names of their own, with its centre at 0, 0, 0.03 in the file, turns"
+    assert note in read_user_object(two, up="z", hinge="0,0,0.01 1,0,0").notes[0]
 
 
 def test_without_names_of_two_parts_the_shells_are_counted(tmp_path):

@@ -61,6 +61,13 @@ def extremes(points_m: np.ndarray) -> np.ndarray:
     return np.concatenate((points_m.min(axis=1), points_m.max(axis=1)), axis=1)
 
 
+def test_the_card_of_lerobot_gives_the_unit_of_a_hinge_and_of_a_slide(store: Store, tmp_path: Path) -> None:
+    export_store(store, "lerobot", tmp_path / "lerobot", progress=False)
+    card = (tmp_path / "lerobot" / "README.md").read_text()
+    (line,) = [line for line in card.splitlines() if "observation.environment_state" in line]
+    assert "joint position from the mesh as stored: hinge angle in radian, slide in metre, 0 if rigid" in line
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_usd_moves_the_part(kind: str, store: Store, tmp_path: Path) -> None:
     from pxr import Usd, UsdGeom
