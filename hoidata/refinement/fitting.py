@@ -14,6 +14,8 @@ from hoidata.refinement.skin import HandPose, SkinnedHand
 STEPS = 20
 SHAPE_STEPS, SHAPE_FRAMES = 12, 48  # most steps of the shape fit; most frames, evenly spaced, that determine a shape
 SHAPE_PRECISION = 0.3  # of the shape's zero-mean normal prior, per frame: errors of keypoints are alike in all frames
+# Largest norm of a bounded shape: 99.9 % of ten standard normal numbers. Recorded shapes that are fitted reach 4.3.
+MAX_SHAPE_NORM = 5.4
 PALM_WEIGHT = 0.5  # a vertex whose skin weight of the wrist is larger belongs to the palm
 MIN_DAMPING, MAX_DAMPING = 1e-8, 1e8
 MIN_GAIN = 1e-4  # the shape fit stops when a step reduces the cost by less than this fraction
@@ -39,6 +41,7 @@ def fit_hands(
     keypoint_ids: np.ndarray,
     generated: Mapping[Side, GeneratedKeypoints],
     template_m: np.ndarray | None = None,
+    bounds_shape: bool = False,
 ) -> dict[Side, HandTrack]:
     """Fit hand poses to generated keypoints, each frame by itself, after one shape per hand over all frames.
 
@@ -46,6 +49,8 @@ def fit_hands(
         betas: (2, 10) shapes of the left and the right hand if they are known; None: fitted.
         keypoint_ids: (keypoint,) vertices, the same on both sides.
         template_m: (2, 778, 3) personal rest meshes instead of the models' templates; not used if shapes are fitted.
+        bounds_shape: whether a fitted shape stays within ``MAX_SHAPE_NORM``: keypoints of a network may be those of no
+            hand, and shapes of 30 standard deviations fit them best.
 
     Returns one track per side, valid in the frames that have the hand. Raises BadInput: arrays of inconsistent shapes,
     or no frame with the hand.
@@ -57,7 +62,11 @@ def fit_hands(
         template = None if template_m is None or betas is None else template_m[index]
         present = np.flatnonzero(hand.is_present)
         keypoints_m = hand.keypoints_m[present]
-        shape = fitted_shape(pair[side], keypoint_ids, keypoints_m) if betas is None else betas[index]
+        if betas is not None:
+            shape = betas[index]
+        else:
+            fitted = bounded_shape if bounds_shape else fitted_shape
+            shape = fitted(pair[side], keypoint_ids, keypoints_m)
         pose = _fitted(pair[side], shape, template, keypoint_ids, keypoints_m)
         # A frame without the hand gets the pose of the nearest frame, so that all numbers are finite.
         nearest = np.abs(np.arange(len(hand.is_present))[:, None] - present).argmin(axis=1)
@@ -94,14 +103,25 @@ def pose_prior(model: HandModel) -> tuple[np.ndarray, np.ndarray]:
     return model.mean_pose, precision
 
 
-def fitted_shape(model: HandModel, ids: np.ndarray, keypoints_m: np.ndarray) -> np.ndarray:
+def bounded_shape(model: HandModel, ids: np.ndarray, keypoints_m: np.ndarray) -> np.ndarray:
+    """As ``fitted_shape``, with the weakest prior by which the norm is at most ``MAX_SHAPE_NORM``."""
+    precision = SHAPE_PRECISION
+    while np.linalg.norm(betas := fitted_shape(model, ids, keypoints_m, precision)) > MAX_SHAPE_NORM:
+        precision *= 4
+    return betas
+
+
+def fitted_shape(
+    model: HandModel, ids: np.ndarray, keypoints_m: np.ndarray, shape_precision: float = SHAPE_PRECISION
+) -> np.ndarray:
     """Fit one shape (10,) to keypoints (frame, keypoint, 3) of vertices ``ids``, together with the poses.
 
     Levenberg-Marquardt; the poses are eliminated from the normal equations (Schur complement).
+    shape_precision: of the shape's prior, per frame.
     """
     chosen = np.unique(np.linspace(0, len(keypoints_m) - 1, min(SHAPE_FRAMES, len(keypoints_m))).round().astype(int))
     keypoints_m, prior = keypoints_m[chosen], pose_prior(model)
-    precision, betas, damping = SHAPE_PRECISION * len(chosen), np.zeros(N_SHAPE), 1e-3
+    precision, betas, damping = shape_precision * len(chosen), np.zeros(N_SHAPE), 1e-3
     skin = SkinnedHand(model, betas, None, ids)
     # Vertices are linear in the shape: the derivatives are differences to the mean shape.
     mean_hand, unit_hands = skin, [SkinnedHand(model, unit, None, ids) for unit in np.eye(N_SHAPE)]

@@ -35,6 +35,7 @@ DIAGNOSED_SAMPLES, DIAGNOSED_CLIPS = 10, 32
 MAX_BATCH_SIZE = 16  # motions of one length that share a batch
 Change = Literal["none", "other path", "other object", "zero map"]
 Preset = Literal["ours", "paper"]
+Shape = Literal["bounded", "fitted", "given"]
 Refinement = Literal["ours", "paper", "none"]  # "paper": Eqs. 9 to 12 (``hoidata.refinement.released``)
 
 
@@ -45,7 +46,9 @@ class FamilyConfig:
     preset: Preset | None = None  # of sampling and refinement; None: the preset of the trained networks
     sampling: Mapping[str, Any] = field(default_factory=dict)  # changes to the preset, see ``SamplingConfig``
     refinement: Refinement | None = None  # of the fitted hands against the object; None: that of the preset
-    shape: Literal["fitted", "given"] = "fitted"  # to the generated keypoints (Eq. 8), or that of the request
+    # Fitted to the generated keypoints (Eq. 8), bounded or not, or that of the request; None: fitted for preset paper,
+    # bounded for ours.
+    shape: Shape | None = None
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class BimArtSampler(ReportsContact):
     pair: HandPair
     synthetic: bool  # whether the networks were trained on generated clips
     refinement: Refinement = "ours"
-    fits_shape: bool = True
+    shape: Shape = "bounded"
     change: Change = "none"  # the condition that a negative control replaces
     annotated: AnnotatedStore | None = None  # the dataset, for negative controls
 
@@ -70,8 +73,9 @@ class BimArtSampler(ReportsContact):
         sampling = sampling_of(preset, config.sampling, "params.yaml: sample.bimart.sampling")
         contact = load_checkpoint(sources.checkpoints / CONTACT.name, CONTACT, sources.device)
         model, synthetic = BimArt.of(contact, motion, sampling, sources.device), bool(motion.facts["synthetic"])
-        refinement, fits_shape = refinement or config.refinement or preset, config.shape == "fitted"
-        return cls(model, sources.hands, synthetic, refinement, fits_shape, change, sources.annotated)
+        refinement = refinement or config.refinement or preset
+        shape = config.shape or ("fitted" if preset == "paper" else "bounded")
+        return cls(model, sources.hands, synthetic, refinement, shape, change, sources.annotated)
 
     def sample_with_targets(
         self, requests: Sequence[Request]
@@ -151,7 +155,8 @@ class BimArtSampler(ReportsContact):
         hands = keypoints_in_world(request, world, motion.keypoints_m, motion.to_object_m)
         clip = clip_without_hands(request, self.synthetic)
         ids = self.model.motion.keypoint_ids.cpu().numpy()
-        tracks = fit_hands(self.pair, None if self.fits_shape else request.betas, ids, hands, request.template_m)
+        betas = request.betas if self.shape == "given" else None
+        tracks = fit_hands(self.pair, betas, ids, hands, request.template_m, self.shape == "bounded")
         if self.refinement != "none":
             refine = refine_hands if self.refinement == "ours" else refine_as_released
             tracks = refine(self.pair, ids, hands, tracks, clip.object)

@@ -14,6 +14,7 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.refinement import GeneratedKeypoints, RefinementSettings, fit_hands, refine_hands
 from hoidata.refinement.banded import solve_damped
+from hoidata.refinement.fitting import MAX_SHAPE_NORM
 from hoidata.refinement.skin import HandPose
 from tests.builders.clips import still_object
 from tests.builders.objects import box_model
@@ -100,6 +101,24 @@ def test_an_unknown_shape_is_fitted_once_per_hand(spread):
     assert max(miss_m(None)) < 0.0005
     if spread:
         assert min(miss_m(np.zeros((2, 10)))) > 3 * max(miss_m(None))
+
+
+def test_a_bounded_shape_of_a_hand_is_the_fitted_one_and_that_of_no_hand_stays_within_the_bound():
+    random, still = np.random.default_rng(4), np.ones(10, bool)
+    fingers = np.tile(PAIR.left.mean_pose.reshape(15, 3), (10, 1, 1))
+    pose = HandPose(np.zeros((10, 3)), rotvec_to_rotmat(random.normal(0, 2, (10, 3))), fingers)
+    points = skin("left", pose.track(random.normal(0, 1, 10), still, None))[:, IDS]
+    wrist = points.mean(axis=1, keepdims=True)
+    shrunken = wrist + (points - wrist) * random.uniform(
+        0.3, 1.3, (1, len(IDS), 1)
+    )  # as a network of few steps may give
+    norms = {}
+    for name, keypoints_m in (("hand", points), ("no hand", shrunken)):
+        generated = {"left": GeneratedKeypoints(keypoints_m, np.zeros_like(keypoints_m), still)}
+        fits = [fit_hands(PAIR, None, IDS, generated, bounds_shape=bounds)["left"].betas for bounds in (False, True)]
+        norms[name] = [float(np.linalg.norm(betas)) for betas in fits]
+    assert norms["hand"][0] == norms["hand"][1] < MAX_SHAPE_NORM
+    assert norms["no hand"][1] <= MAX_SHAPE_NORM < norms["no hand"][0]
 
 
 def test_a_frame_without_the_hand_is_invalid_and_has_finite_numbers():

@@ -152,13 +152,13 @@ def test_samples_follow_the_objects_motion_and_do_not_depend_on_recorded_hands(
 
 
 def test_refinement_and_shape_follow_the_preset_unless_they_are_set(sources: Sources) -> None:
-    def loaded(**section: Any) -> tuple[str, bool]:
+    def loaded(**section: Any) -> tuple[str, str]:
         sampler = BimArtSampler.load(replace(sources, settings={"bimart": section}))
-        return sampler.refinement, sampler.fits_shape
+        return sampler.refinement, sampler.shape
 
-    assert loaded() == ("ours", True)
-    assert loaded(preset="paper") == ("paper", True)
-    assert loaded(preset="paper", refinement="none", shape="given") == ("none", False)
+    assert loaded() == ("ours", "bounded")
+    assert loaded(preset="paper") == ("paper", "fitted")
+    assert loaded(preset="paper", refinement="none", shape="given") == ("none", "given")
     assert UNREFINED.load(sources).refinement == "none"  # pyright: ignore[reportAttributeAccessIssue]
     with pytest.raises(BadInput, match="refined is now refinement"):
         loaded(refined=False)
@@ -171,7 +171,7 @@ def test_the_given_shape_is_kept_and_a_fitted_one_is_that_of_the_keypoints(
     sampler = BimArtSampler.load(sources, "none")
     (motion,) = sampler.sample_motions([request])
     side = SIDES[int(np.flatnonzero(request.active_hands)[0])]
-    kept = replace(sampler, fits_shape=False).clip(request, motion).hands[side]
+    kept = replace(sampler, shape="given").clip(request, motion).hands[side]
     np.testing.assert_array_equal(kept.betas, np.full((1, 10), 0.5, np.float32))
     fitted = sampler.clip(request, motion).hands[side]
     other = sampler.clip(replace(request, betas=np.zeros((2, 10), np.float32)), motion).hands[side]
