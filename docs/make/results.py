@@ -60,18 +60,6 @@ TEXT = {
     "mean-motion": "mean motion",
     "other-prompt": "other prompt",
 }
-PRESETS = {
-    "ground-truth": "recorded",
-    "paper/text2hoi-coarse": "`paper`, networks alone",
-    "paper/text2hoi": "`paper`",
-    "text2hoi-coarse": "`ours`, networks alone",
-    "text2hoi": "`ours`",
-    "text2hoi-contact": "`ours`, contact refinement",
-    "best-of-5/text2hoi": "`ours`, best of 5",
-    "prompt-retrieval": "retrieval",
-    "mean-motion": "mean motion",
-    "other-prompt": "other prompt",
-}
 CONTROLS = {
     "ground-truth": "recorded",
     "random-clip": "random training clip",
@@ -162,13 +150,6 @@ TABLES = {
         intervals=False,
         unranked=frozenset(CONTROLS),
     ),
-    "presets": Table(
-        {"presets-study": "subjects", "presets-composition": "composition", "presets-object": "unseen object"}
-        | {"presets-arctic": "ARCTIC"},
-        PRESETS,
-        OF_TEXT,
-        intervals=False,
-    ),
     "embedded": Table(
         {"embedded-h2o": "H2O", "embedded-grab": "GRAB", "embedded-arctic": "ARCTIC"},
         {family: title for family, title in TEXT.items() if family not in ("prompt-retrieval-refined", "mean-motion")},
@@ -200,18 +181,12 @@ def collect(name: str, metrics: Path) -> None:
 
 
 def read(name: str) -> Methods:
-    """Metrics by method; of `bench presets` by ``<run>/<family>``, those of its run `ours` by family."""
-    content = json.loads((RESULTS / f"{name}.json").read_text())
-    if not name.startswith("presets-"):
-        return content
-    runs = {run.rpartition(" ")[0]: run_content["methods"] for run, run_content in content.items()}
-    others = {f"{run}/{family}": values for run, methods in runs.items() for family, values in methods.items()}
-    return others | runs["ours"]
+    return json.loads((RESULTS / f"{name}.json").read_text())
 
 
 def markdown(table: Table) -> str:
     """The table from its files."""
-    first = [] if "" in table.files.values() else ["data, clips"]
+    first = [] if "" in table.files.values() else ["format, clips"]
     head = [*first, "method", *table.columns]
     lines = []
     for name, title in table.files.items():
