@@ -1,4 +1,4 @@
-"""Generated clips in the frame of a user's mesh, which is z up and closed as it is stored."""
+"""Generated clips in the frame of a user's mesh, which is z up and closed as in its file."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence

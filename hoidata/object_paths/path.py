@@ -121,10 +121,10 @@ def _steps_at(steps: Sequence[PathStep], frame: int) -> list[PathStep]:
     return [step for step in steps if step.start_s - 1e-6 <= frame / FPS <= step.end_s + 1e-6]
 
 
-def check_joint_kind(model: ObjectModel, is_slide: bool, where: str | Path) -> None:
+def check_joint_kind(model: ObjectModel, is_slide: bool, source: str | Path) -> None:
     """Raise BadInput if a motion of a slide is for an object that turns, or the other way round.
 
-    where: the motion, for the message.
+    source: the motion, for the message.
     """
     if model.hinge is None or model.hinge.is_prismatic == is_slide:
         return
@@ -132,14 +132,14 @@ def check_joint_kind(model: ObjectModel, is_slide: bool, where: str | Path) -> N
     verb, column = ("slides", "slide_cm") if model.hinge.is_prismatic else ("turns", "hinge_deg")
     expected = f"{kinds[model.hinge.is_prismatic]}: {model.name!r} {verb}"
     remedy = f"give the object of this motion, or --keyframes with a column {column}"
-    raise BadInput(where, expected, kinds[is_slide], remedy)
+    raise BadInput(source, expected, kinds[is_slide], remedy)
 
 
 def check_joint_range(
     model: ObjectModel,
     hinge_rad: np.ndarray | None,
     limits_rad: tuple[float, float] | None,
-    where: str | Path,
+    source: str | Path,
     steps: Sequence[PathStep] = (),
 ) -> None:
     """Raise BadInput if a joint leaves its limits; nothing is checked if positions or limits are None.
@@ -147,7 +147,7 @@ def check_joint_range(
     Args:
         hinge_rad: (frame,) joint positions, radians or metres.
         limits_rad: smallest and largest joint position.
-        where: the motion, for the message.
+        source: the motion, for the message.
         steps: time intervals, for the message.
     """
     if hinge_rad is None or limits_rad is None or not len(hinge_rad):
@@ -161,7 +161,7 @@ def check_joint_range(
     if model.hinge is not None and (rest := model.hinge.file_position):
         expected += f", counted from the URDF's limit of {_position_words(rest, slides)}, where the mesh rests"
     got = f"{_position_words(hinge_rad[frame], slides)}, from {_step_at(steps, int(outside.argmax()))} on"
-    raise BadInput(where, expected, got, "keep the joint within, or give its range (--hinge-range)")
+    raise BadInput(source, expected, got, "keep the joint within, or give its range (--hinge-range)")
 
 
 def _any_range(model: ObjectModel) -> tuple[float, float]:

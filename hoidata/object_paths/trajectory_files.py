@@ -125,7 +125,7 @@ def parse_csv(data: bytes, source: str, unit: str = "m") -> TrajectoryFile:
     if unknown := [name for name in names if name not in read and name.rpartition("_")[2] in PARTS and "_" in name]:
         raise BadInput(source, expected, f"{', '.join(unknown)}"[:200], "correct the names, or remove the columns")
     if separator == ";":
-        rows = [[cell.replace(",", ".") for cell in row] for row in rows]
+        rows = [[cell.replace(",", ".") for cell in cells] for cells in rows]
     chosen = [names.index(name) for name in read]
     columns = dict(zip(read, _numbers(rows[1:], names, source, chosen).T, strict=True))
     arrays = {"time_s": columns["time_s"]}
@@ -201,15 +201,15 @@ def _numbers(
         raise BadInput(source, f"at most {MAX_FRAMES} frames", f"{len(rows)}", "cut it into pieces")
     table = np.empty((len(rows), len(chosen)))
     for number, cells in enumerate(rows):
-        where = f"{source}: row {number + 1}"
+        row_source = f"{source}: row {number + 1}"
         if len(cells) != len(names):
-            raise BadInput(where, f"{len(names)} numbers", f"{len(cells)}", "correct the row")
-        for place, column in enumerate(chosen):
+            raise BadInput(row_source, f"{len(names)} numbers", f"{len(cells)}", "correct the row")
+        for index, column in enumerate(chosen):
             try:
-                table[number, place] = float(cells[column]) if cells[column].strip() else np.nan
+                table[number, index] = float(cells[column]) if cells[column].strip() else np.nan
             except ValueError as error:
                 got = ascii(cells[column][:40])
-                raise BadInput(f"{where}, {names[column]}", "a number", got, "correct it") from error
+                raise BadInput(f"{row_source}, {names[column]}", "a number", got, "correct it") from error
     return table
 
 

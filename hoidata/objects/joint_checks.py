@@ -14,11 +14,11 @@ MAX_SLIDE_DIAGONALS = 10.0  # of the limits of a slide
 _FAR = 1e6  # diagonals; beyond it the distance from the centre is precise enough
 
 
-def check_limits(where: str, is_prismatic: bool, limits: tuple[float, float], diagonal: float) -> None:
+def check_limits(source: str, is_prismatic: bool, limits: tuple[float, float], diagonal: float) -> None:
     """Raise BadInput for limits that no joint of the mesh has.
 
     Args:
-        where: the joint, for messages.
+        source: the joint, for messages.
         limits: lowest and highest position, radians, or the mesh's unit if prismatic.
         diagonal: of the mesh's bounding box, the mesh's unit.
     """
@@ -26,12 +26,12 @@ def check_limits(where: str, is_prismatic: bool, limits: tuple[float, float], di
     unlimited = 'if the joint has no stop, remove the element "limit"'
     if is_prismatic and largest > MAX_SLIDE_DIAGONALS * diagonal:
         expected = f"limits of at most {MAX_SLIDE_DIAGONALS * diagonal:.3g}, ten times the diagonal of the meshes"
-        raise BadInput(where, expected, got, f"they look like another unit: write that of the meshes; {unlimited}")
+        raise BadInput(source, expected, got, f"they look like another unit: write that of the meshes; {unlimited}")
     if not is_prismatic and largest > MAX_TURN_RAD:
         unlimited = "if the joint has no stop, make its type continuous"
         radians = " and ".join(f"{math.radians(limit):.4g}" for limit in limits)
         remedy = f"they look like degrees: write radians, {radians}; {unlimited}" if largest < 1e4 else unlimited
-        raise BadInput(where, "limits of at most 4 pi rad, two turns", got, remedy)
+        raise BadInput(source, "limits of at most 4 pi rad, two turns", got, remedy)
 
 
 def check_axis_is_near(vertices: np.ndarray, hinge: Hinge, unit: str, units_m: Mapping[str, float]) -> None:
@@ -41,7 +41,7 @@ def check_axis_is_near(vertices: np.ndarray, hinge: Hinge, unit: str, units_m: M
         vertices: (vertex, 3), the file's unit.
         hinge: the joint in the same unit.
         unit: name of that unit.
-        units_m: metres of each unit by name.
+        units_m: metres of each unit.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     diagonal = float(np.linalg.norm(high - low))
@@ -77,5 +77,5 @@ def _distance_to_box(point: np.ndarray, direction: np.ndarray, low: np.ndarray, 
         return float(np.linalg.norm(on_line - np.clip(on_line, -half, half)))
 
     # Distance to a convex set is convex along a line, so one search finds the minimum.
-    found = minimize_scalar(gap, bounds=(-reach, reach), method="bounded", options={"xatol": 1e-6 * reach})
-    return gap(float(found.x))
+    minimum = minimize_scalar(gap, bounds=(-reach, reach), method="bounded", options={"xatol": 1e-6 * reach})
+    return gap(float(minimum.x))

@@ -237,8 +237,8 @@ def _chosen_joint(path: Path, movable: list[Joint], bare: list[Joint], moving: s
     if not movable and not bare and not moving:
         return None
     if bare and not movable and not moving:
-        where, expected = f"{path}: joint {bare[0].name!r}", f"a mesh in its link {bare[0].child!r}"
-        raise BadInput(where, expected, "none", "add a visual or collision mesh; or make the joint fixed")
+        source, expected = f"{path}: joint {bare[0].name!r}", f"a mesh in its link {bare[0].child!r}"
+        raise BadInput(source, expected, "none", "add a visual or collision mesh; or make the joint fixed")
     names = [f"{joint.name} ({joint.kind})" for joint in movable]
     names += [f"{joint.name} (its link {joint.child} has no mesh)" for joint in bare]
     listed = ", ".join(names[:20]) or "none"

@@ -222,9 +222,9 @@ def test_a_motion_of_the_other_kind_of_joint_or_beyond_its_limits_is_refused(tmp
         arrays = motion_arrays(clip_of("a/b/c", track), HANDS) | mesh_arrays(track.model)
         write_npz(tmp_path / f"{name}.npz", arrays)
     write_npz(tmp_path / "old.npz", {key: value for key, value in arrays.items() if "hinge_axis" not in key})
-    slide, turn, old = (str(tmp_path / f"{name}.npz") for name in ("slide", "turn", "old"))
+    slide, turned, old = (str(tmp_path / f"{name}.npz") for name in ("slide", "turn", "old"))
     with pytest.raises(BadInput, match=r"turn\.npz: expected a slide in metres: 'drawer' slides, got a hinge angle"):
-        selected(object=drawer, motion=turn)
+        selected(object=drawer, motion=turned)
     with pytest.raises(BadInput, match=r"a hinge angle in radians: '4321' turns.*keyframes with a column hinge_deg"):
         selected(object=door, motion=slide, mesh=MeshOptions(moving="joint_0"))
     with pytest.raises(
@@ -232,8 +232,8 @@ def test_a_motion_of_the_other_kind_of_joint_or_beyond_its_limits_is_refused(tmp
     ):
         selected(object=drawer, motion=old)  # the file does not say which kind, but leaves the limits
     with pytest.raises(BadInput, match=r"turn\.npz: expected a hinge angle of 0 to 20 deg, got 30 deg"):
-        selected(motion=turn, hinge_range="0:20")
-    assert selected(motion=turn, hinge_range="0:40").track.n_frames == 61
+        selected(motion=turned, hinge_range="0:20")
+    assert selected(motion=turned, hinge_range="0:40").track.n_frames == 61
     assert selected(object=drawer, motion=slide).track.n_frames == 61
 
 
