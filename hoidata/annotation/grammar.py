@@ -120,9 +120,12 @@ def inflect_verb(base: str) -> VerbForms:
         first, second = (inflect_verb(verb).forms for verb in base.split(" and ", 1))
         return VerbForms(*map(" and ".join, zip(first, second, strict=True)))
     head, _, rest = base.partition(" ")
-    tagged = zip(("VBG", "VBN", "VBZ"), regular_forms(head), strict=True)
-    forms = [(getInflection(head, tag=tag, inflect_oov=False) or [regular])[0] for tag, regular in tagged]
-    return _phrase((head, *forms), rest)
+    regular = regular_forms(head)
+    tagged = zip(("VBG", "VBN", "VBZ"), regular, strict=True)
+    forms = [(getInflection(head, tag=tag, inflect_oov=False) or [form])[0] for tag, form in tagged]
+    # The dictionary has clippings such as "gon" for "going to", which have no gerund.
+    gerund = forms[0] if forms[0].endswith("ing") else regular[0]
+    return _phrase((head, gerund, *forms[1:]), rest)
 
 
 def _phrase(forms: Iterable[str], rest: str) -> VerbForms:

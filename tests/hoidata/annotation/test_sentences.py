@@ -207,6 +207,7 @@ MADE_UP_NOUN = st.from_regex(r"([a-z]{2,8} )?[a-z]{3,9}", fullmatch=True)
 @pytest.mark.slow
 @settings(max_examples=400)
 @example("aa", "is aaa", "left")
+@example("gon", "aaa", "left")
 @given(MADE_UP_VERB, MADE_UP_NOUN, st.sampled_from(["left", "right", "both"]))
 def test_made_up_words_never_break_article_agreement_or_shape(verb: str, noun: str, hand) -> None:
     sentences = english_sentences(verb, noun, hand)
