@@ -14,7 +14,7 @@ from hoidata.refinement.skin import HandPose, SkinnedHand
 STEPS = 20
 SHAPE_STEPS, SHAPE_FRAMES = 12, 48  # most steps of the shape fit; most frames, evenly spaced, that determine a shape
 SHAPE_PRECISION = 0.3  # of the shape's zero-mean normal prior, per frame: errors of keypoints are alike in all frames
-# Largest norm of a bounded shape: 99.9 % of ten standard normal numbers. Recorded shapes that are fitted reach 4.3.
+# Largest norm of a bounded shape: 99.9 % of ten standard normal numbers. Fits of recorded ARCTIC hands just exceed it.
 MAX_SHAPE_NORM = 5.4
 PALM_WEIGHT = 0.5  # a vertex whose skin weight of the wrist is larger belongs to the palm
 MIN_DAMPING, MAX_DAMPING = 1e-8, 1e8
