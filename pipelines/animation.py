@@ -424,8 +424,8 @@ def _from_tracker(
         received = (calibrated_frame(frame, offsets) for frame in received)
     frames, poses, dropped = _played(predictor, hands, models, received, show)
     notes.append(
-        f"{tracker.refused} of {tracker.received} datagrams were refused; {dropped} had a time, in seconds, that was "
-        "repeated, late or not followed by another one within half a second"
+        f"{tracker.refused} of {tracker.received} datagrams were refused; {dropped} frames were skipped, whose time in "
+        "seconds was repeated, late, or not followed by another one within half a second"
     )
     control, valid = control_of_frames(frames, models["right"])
     if control and options.left_object:

@@ -227,12 +227,13 @@ def _array(
     array = np.asarray(arrays[name])
     fits = array.ndim == 1 + len(shape) and array.shape[1:] == shape and len(array) == (count or len(array))
     is_number = array.dtype.kind in "fiu"
-    if not fits or not is_number or not ((np.abs(array) < MAX_ABS_VALUE) | (may_be_lost & np.isnan(array))).all():
+    is_usable = (np.abs(array) < MAX_ABS_VALUE) | (may_be_lost & np.isnan(array)) if is_number else np.zeros(1, bool)
+    if not fits or not is_usable.all():
         expected = f"finite numbers of shape ({count or 'frame'}, {', '.join(map(str, shape))})"
         got = f"{array.dtype} {array.shape}"
         if fits and is_number:
-            bad = ~(np.abs(array) < MAX_ABS_VALUE).reshape(len(array), -1).all(axis=1)
-            got = f"{array[bad.argmax()]} in row {bad.argmax() + 1}"
+            row_number = int(is_usable.reshape(len(array), -1).all(axis=1).argmin())
+            got = f"{array[row_number]} in row {row_number + 1}"
         raise BadInput(f"{source}: {name}", expected, got, "correct it")
     return array.astype(np.float64)
 

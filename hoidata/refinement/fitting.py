@@ -104,7 +104,7 @@ def pose_prior(model: HandModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bounded_shape(model: HandModel, ids: np.ndarray, keypoints_m: np.ndarray) -> np.ndarray:
-    """As ``fitted_shape``, with the weakest prior by which the norm is at most ``MAX_SHAPE_NORM``."""
+    """As ``fitted_shape``, but the prior is made four times as strong until the norm is at most ``MAX_SHAPE_NORM``."""
     precision = SHAPE_PRECISION
     while np.linalg.norm(betas := fitted_shape(model, ids, keypoints_m, precision)) > MAX_SHAPE_NORM:
         precision *= 4

@@ -62,9 +62,8 @@ def control_of_two_objects(
     inputs = {side: control_from_file(file.of(side), models[side], hands) for side in SIDES}
     wrists: dict[Side, Motion] = {side: inputs[side].control.wrists[side] for side in SIDES}
     left, right = (replace(one.control, wrists=wrists) for one in inputs.values())
-    return AnimationInput(
-        replace(right, left=left), list(SIDES), [note for one in inputs.values() for note in one.notes]
-    )
+    notes = dict.fromkeys(note for one in inputs.values() for note in one.notes)  # notes on the file are in both
+    return AnimationInput(replace(right, left=left), list(SIDES), list(notes))
 
 
 def at_rate(control: Control, fps: int = FPS) -> Control:

@@ -109,9 +109,8 @@ def test_a_bounded_shape_of_a_hand_is_the_fitted_one_and_that_of_no_hand_stays_w
     pose = HandPose(np.zeros((10, 3)), rotvec_to_rotmat(random.normal(0, 2, (10, 3))), fingers)
     points = skin("left", pose.track(random.normal(0, 1, 10), still, None))[:, IDS]
     wrist = points.mean(axis=1, keepdims=True)
-    shrunken = wrist + (points - wrist) * random.uniform(
-        0.3, 1.3, (1, len(IDS), 1)
-    )  # as a network of few steps may give
+    # As a network of few training steps may give.
+    shrunken = wrist + (points - wrist) * random.uniform(0.3, 1.3, (1, len(IDS), 1))
     norms = {}
     for name, keypoints_m in (("hand", points), ("no hand", shrunken)):
         generated = {"left": GeneratedKeypoints(keypoints_m, np.zeros_like(keypoints_m), still)}
