@@ -18,10 +18,10 @@ from hoidata.store.annotated import SUBSETS, AnnotatedStore, load_annotated
 from pipelines.commands.store_facts import Rows, fact_rows
 from pipelines.pages.clip_page import page_name, write_clip_page
 from pipelines.pages.curves import COLOURS, figure_svg
-from pipelines.pages.dataset_facts import UNLABELLED, count_values, read_dataset
+from pipelines.pages.dataset_facts import UNLABELLED, DatasetFacts, count_values, read_dataset
 from pipelines.pages.examples import true_contact
 from pipelines.pages.player import Player, motion_player, write_page
-from pipelines.pages.quality import read_quality
+from pipelines.pages.quality import QualityFacts, read_quality
 
 EXAMPLES = 6
 SHOWN_BARS = 24
@@ -51,14 +51,26 @@ class ObjectContact(NamedTuple):
 def write_dataset_page(
     out: str | Path, root: Path, name: str, hands: HandPair, title: str = "", examples: int = EXAMPLES
 ) -> Path:
-    """Write ``out/<name>.html`` and, for its examples, ``out/clips/<clip>.html``; equal inputs give equal bytes.
-
-    ``root`` has the outputs of the dataset's stages. Raises MissingResource if it has no clips or a stage has not run.
-    """
+    """Write the page of a dataset; ``root`` has the outputs of its stages. See ``write_page_of``."""
     facts = read_dataset(root, name, hands)
     if facts.empty:
         raise MissingResource(f"{name} has no clips to show: {facts.empty}")
-    annotated = load_annotated(root, hands)
+    return write_page_of(out, facts, load_annotated(root, hands), read_quality(root / "quality", name), title, examples)
+
+
+def write_page_of(
+    out: str | Path,
+    facts: DatasetFacts,
+    annotated: AnnotatedStore,
+    quality: QualityFacts | None,
+    title: str = "",
+    examples: int = EXAMPLES,
+) -> Path:
+    """Write ``out/<name>.html`` and, for its examples, ``out/clips/<clip>.html``; equal inputs give equal bytes.
+
+    Raises MissingResource if a stage has not run.
+    """
+    name = facts.name
     seconds = annotated.store.sequences["n_frames"].to_numpy() / FPS
     return write_page(
         Path(out) / f"{name}.html",
@@ -69,9 +81,9 @@ def write_dataset_page(
         charts=count_charts(annotated),
         lengths=Markup(lengths_svg(seconds, f"{name} lengths")),
         length_words="Shortest {:.2f} s, median {:.2f} s, longest {:.2f} s.".format(*np.quantile(seconds, (0, 0.5, 1))),
-        examples=_examples(out, annotated, hands, examples),
+        examples=_examples(out, annotated, examples),
         splits=split_rows(annotated),
-        quality=read_quality(root / "quality", name),
+        quality=quality,
         contact=contact_by_object(annotated),
         threshold_cm=annotated.contact_threshold_m * 100,
         without_sentences=clips_without_sentences(annotated),
@@ -135,11 +147,9 @@ def example_ids(annotated: AnnotatedStore, count: int) -> list[str]:
     return chosen
 
 
-def _examples(
-    out: str | Path, annotated: AnnotatedStore, hands: HandPair, count: int
-) -> list[tuple[Player, str, str, str]]:
+def _examples(out: str | Path, annotated: AnnotatedStore, count: int) -> list[tuple[Player, str, str, str]]:
     """(still, sentence, clip, link) of each example; writes their pages."""
-    examples = []
+    hands, examples = annotated.store.hand_pair(), []
     for clip_id in example_ids(annotated, count):
         link = f"{CLIP_FOLDER}/{page_name(clip_id)}"
         write_clip_page(Path(out) / link, annotated, clip_id, hands)

@@ -16,7 +16,7 @@ from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.info import embedded_hand_warning
 from pipelines.pages.curves import Panel, log_curves, panels_svg
 from pipelines.pages.dataset_facts import DatasetFacts, has_tables, read_dataset
-from pipelines.pages.dataset_page import write_dataset_page
+from pipelines.pages.dataset_page import write_page_of
 from pipelines.pages.examples import first_motion, motion_contact, shown_ids, shown_subset, true_contact
 from pipelines.pages.metrics_table import CONTROLS, RETRIEVAL_BASELINES, MetricsTable, metrics_tables
 from pipelines.pages.player import Player, contact_player, motion_player, write_page
@@ -107,8 +107,8 @@ def write_report(
     synthetic = any(section.facts.synthetic for section in sections)
     has_players = any(section.motions or section.contact or section.examples for section in sections)
     for section in sections:
-        if section.page:
-            write_dataset_page(out, folders.data / section.facts.name, section.facts.name, hands, section.title)
+        if section.page and section.facts.annotated:
+            write_page_of(out, section.facts, section.facts.annotated, section.quality, section.title)
     return write_page(
         Path(out) / "index.html", "report.html", title=f"hoidata report: {profile}", profile=profile, sections=sections,
         empty=[(section.title, section.facts.empty) for section in all_sections if section.facts.empty],
