@@ -50,6 +50,7 @@ COLUMNS = {
     "Pen, released": ("bimart_pen_1cm_paper", 1),
     "acceleration, released": ("bimart_accel_paper", 3),
 }
+PAPER = {"paper/text2hoi-coarse": "`paper`, networks alone", "paper/text2hoi": "`paper`"}
 TEXT = {
     "ground-truth": "recorded",
     "text2hoi-coarse": "networks alone",
@@ -59,6 +60,21 @@ TEXT = {
     "nearest-clip": "nearest sentence",
     "mean-motion": "mean motion",
     "other-prompt": "other prompt",
+}
+PRESETS = {
+    "ground-truth": "recorded",
+    **PAPER,
+    "text2hoi-coarse": "`ours`, networks alone",
+    "text2hoi": "**`ours`**",
+    "text2hoi-contact": "`ours`, contact refinement",
+    "best-of-5/text2hoi": "`ours`, best of 5",
+    "prompt-retrieval": "retrieval",
+    "prompt-retrieval-refined": "retrieval, refined",
+    "nearest-clip": "nearest sentence",
+    "mean-motion": "mean motion",
+    "other-prompt": "other prompt",
+    "random-clip": "random training clip",
+    "static": "first frame, repeated",
 }
 CONTROLS = {
     "ground-truth": "recorded",
@@ -113,7 +129,8 @@ TABLES = {
     ),
     "arctic-text": Table(
         {"arctic": ""},
-        {family: title for family, title in TEXT.items() if family != "nearest-clip"},
+        {"ground-truth": "recorded", **PAPER}
+        | {family: title for family, title in TEXT.items() if family != "nearest-clip"},
         OF_TEXT,
     ),
     "arctic-hands": Table(
@@ -150,6 +167,13 @@ TABLES = {
         intervals=False,
         unranked=frozenset(CONTROLS),
     ),
+    "presets": Table(
+        {"presets-study": "subjects", "presets-composition": "composition", "presets-object": "unseen object"},
+        PRESETS,
+        OF_TEXT,
+        intervals=False,
+        unranked=frozenset({RECORDED, "random-clip", "static"}),
+    ),
     "embedded": Table(
         {"embedded-h2o": "H2O", "embedded-grab": "GRAB", "embedded-arctic": "ARCTIC"},
         {family: title for family, title in TEXT.items() if family not in ("prompt-retrieval-refined", "mean-motion")},
@@ -181,12 +205,18 @@ def collect(name: str, metrics: Path) -> None:
 
 
 def read(name: str) -> Methods:
-    return json.loads((RESULTS / f"{name}.json").read_text())
+    """Metrics by method; of `bench presets` by ``<run>/<family>``, those of its run `ours` by family."""
+    content = json.loads((RESULTS / f"{name}.json").read_text())
+    if not name.startswith("presets-"):
+        return content
+    runs = {run.rpartition(" ")[0]: run_content["methods"] for run, run_content in content.items()}
+    others = {f"{run}/{family}": values for run, methods in runs.items() for family, values in methods.items()}
+    return others | runs["ours"]
 
 
 def markdown(table: Table) -> str:
     """The table from its files."""
-    first = [] if "" in table.files.values() else ["format, clips"]
+    first = [] if "" in table.files.values() else ["data, clips"]
     head = [*first, "method", *table.columns]
     lines = []
     for name, title in table.files.items():
