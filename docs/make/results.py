@@ -123,7 +123,7 @@ class Table:
 TABLES = {
     "arctic-short": Table(
         {"arctic": ""},
-        {"ground-truth": "recorded", **PAPER}
+        {"ground-truth": "recorded", "paper/text2hoi": "`paper`"}
         | {family: TEXT[family] for family in ("text2hoi", "prompt-retrieval", "mean-motion")},
         ("verb accuracy", "contact F1", "deep", "jitter", "joints"),
         intervals=False,
@@ -169,7 +169,7 @@ TABLES = {
         unranked=frozenset(CONTROLS),
     ),
     "presets": Table(
-        {"presets-study": "subjects", "presets-composition": "composition", "presets-object": "unseen object"},
+        {"presets-study": "subjects"},
         PRESETS,
         OF_TEXT,
         intervals=False,
