@@ -107,7 +107,7 @@ def write_report(
     synthetic = any(section.facts.synthetic for section in sections)
     has_players = any(section.motions or section.contact or section.examples for section in sections)
     for section in sections:
-        if section.page and section.facts.annotated:
+        if section.page and section.facts.annotated is not None:
             write_page_of(out, section.facts, section.facts.annotated, section.quality, section.title)
     return write_page(
         Path(out) / "index.html", "report.html", title=f"hoidata report: {profile}", profile=profile, sections=sections,
