@@ -166,7 +166,7 @@ TABLES = {
         unranked=frozenset(CONTROLS),
     ),
     "presets": Table(
-        {"presets-study": "subjects", "presets-composition": "composition"},
+        {"presets-study": "subjects", "presets-composition": "composition", "presets-object": "unseen object"},
         PRESETS,
         ("verb accuracy", "contact F1", "adherence", "deep", "slip", "realism", "joints"),
         intervals=False,
