@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,13 +32,6 @@ PAPER_FEATURES, SHARED_SPACE = 128, 64
 FEATURES, FEATURES_FEW_CLIPS, FEW_CLIPS = 32, 16, 256
 DIGITS = 4
 Results = dict[str, Any]
-ClipWords = tuple[str, str, str]  # label, object, hand of one clip
-INPUTS: dict[str, Callable[[ClipWords], tuple[str, ...]]] = {
-    "nothing": lambda words: (),
-    "object": lambda words: words[1:2],
-    "hand": lambda words: words[2:],
-    "object and hand": lambda words: words[1:],
-}
 
 
 class Trained(NamedTuple):
@@ -119,7 +111,6 @@ def train_evaluators(
     info: dict[str, Any] = {
         "labels": list(parts["train"].trained_verbs),
         "clips": {split: len(examples) for split, examples in parts.items()},
-        "majority": majority_baseline(*(_labelled(parts[split]) for split in ("train", "test"))),
         "evaluators": {},
     }
     runs = [(name, seed) for name in settings.networks for seed in settings.seeds]
@@ -207,12 +198,6 @@ def _accuracies(network: MotionEncoder, task: Classification, examples: Examples
     return {f"top{k}": round(float((rank < k).double().mean()), DIGITS) for k in (1, 3)}
 
 
-def _labelled(examples: Examples) -> list[ClipWords]:
-    """Label, object and hand of each clip with a label."""
-    clips = zip(examples.verbs, examples.objects, examples.hands, strict=True)
-    return [(label, noun, hand) for label, noun, hand in clips if label]
-
-
 def _facts(
     name: str,
     best: Trained,
@@ -229,33 +214,3 @@ def _facts(
         "synthetic": bool(annotated.info["synthetic"]),
         "encoder": annotated.encoder_identity,
     }
-
-
-def majority_baseline(train: Sequence[ClipWords], test: Sequence[ClipWords]) -> dict[str, dict[str, float]]:
-    """The accuracy of guessing the most frequent training labels, given nothing, the object, the hand or both.
-
-    Ties are broken alphabetically. An input without training clips gets the ranking over all clips.
-
-    Returns:
-        Per input, the accuracies top1 and top3 on test clips.
-    """
-    return {name: _majority_accuracy(train, test, key) for name, key in INPUTS.items()} if train and test else {}
-
-
-def ranked_labels(
-    train: Sequence[ClipWords], key: Callable[[ClipWords], tuple[str, ...]]
-) -> dict[tuple[str, ...], list[str]]:
-    """Per input, the labels of training clips, most frequent first."""
-    counts: defaultdict[tuple[str, ...], Counter[str]] = defaultdict(Counter)
-    for clip in train:
-        counts[key(clip)][clip[0]] += 1
-    return {words: sorted(count, key=lambda label: (-count[label], label)) for words, count in counts.items()}
-
-
-def _majority_accuracy(
-    train: Sequence[ClipWords], test: Sequence[ClipWords], key: Callable[[ClipWords], tuple[str, ...]]
-) -> dict[str, float]:
-    ranked, default = ranked_labels(train, key), ranked_labels(train, INPUTS["nothing"])[()]
-    guesses = [ranked.get(key(clip), default) for clip in test]
-    hits = {k: sum(clip[0] in guess[:k] for clip, guess in zip(test, guesses, strict=True)) for k in (1, 3)}
-    return {f"top{k}": round(count / len(test), 4) for k, count in hits.items()}

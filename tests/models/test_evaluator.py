@@ -22,7 +22,7 @@ from models.evaluator.encoders import MotionEvaluator, load_evaluators, weights_
 from models.evaluator.inputs import CORRECTED_SIZE, OBJECT, Examples, corrected_input, padded, random_frames
 from models.evaluator.networks import EncoderConfig, MotionEncoder, rotated
 from models.evaluator.settings import EvaluatorSettings
-from models.evaluator.stage import majority_baseline, train_evaluators
+from models.evaluator.stage import train_evaluators
 from models.evaluator.training import Classification, Pairing
 from tests.builders.clips import build_clip, in_another_world, with_hand, with_object
 from tests.builders.objects import box_model
@@ -216,7 +216,6 @@ def test_the_stage_writes_the_accuracy_on_recorded_clips(trained):
     assert {one.name: one.digest for one in load_evaluators(trained)} == {
         name: network_info["digest"] for name, network_info in info["evaluators"].items()
     }
-    assert set(info["majority"]) == {"nothing", "object", "hand", "object and hand"}
 
 
 @pytest.mark.long
@@ -313,12 +312,3 @@ def test_padding_is_ignored():
     changed[0, 4:] = 5
     with torch.no_grad():
         assert torch.equal(network(motion, lengths)[0], network(changed, lengths)[0])
-
-
-def test_the_majority_baseline_uses_training_clips():
-    train = [("lift", "cup", "left")] * 3 + [("pour", "cup", "right")] * 2 + [("open", "box", "right")]
-    test = [("pour", "cup", "right"), ("lift", "cup", "right"), ("open", "box", "left"), ("lift", "jar", "left")]
-    accuracies = majority_baseline(train, test)
-    assert accuracies["nothing"] == {"top1": 0.5, "top3": 1.0}
-    assert accuracies["object"] == {"top1": 0.75, "top3": 1.0}
-    assert accuracies["object and hand"] == {"top1": 0.5, "top3": 0.75}
