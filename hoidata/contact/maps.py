@@ -28,7 +28,7 @@ def find_active_hands(
     for side in SIDES:
         closest = index.closest_m(joints_m[side], clip.object)
         distance[side] = np.where(clip.hands[side].valid, closest, np.inf)
-    return HandEvidence(None, distance, threshold_m).at_threshold(threshold_m)
+    return HandEvidence(distance, threshold_m)
 
 
 def distance_entries(

@@ -145,7 +145,7 @@ class AnnotatedStore:
             value = self.hand_types.at[clip_id, f"min_{side}_m"]
             smallest[side] = np.inf if pd.isna(value) else float(value)
         limit_m: float = self.annotation_info["threshold_m"] if threshold_m is None else threshold_m
-        return HandEvidence(None, self._hand_distances.of(index), limit_m, smallest).at_threshold(limit_m)
+        return HandEvidence(self._hand_distances.of(index), limit_m, smallest)
 
     def sentences(self, clip_id: str) -> tuple[str, ...]:
         """Return the sentences of a clip, one of each form (``hoidata.annotation.sentences``)."""

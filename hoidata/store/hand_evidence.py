@@ -3,7 +3,7 @@
 ``hand_distance.npz`` has the distance of each frame, ``hand_type.parquet`` the exact minimum of each clip.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,6 @@ import numpy as np
 from hoidata.clips.clip import SIDES, HandType, Side
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.arrays import write_npz
-from hoidata.files.written import read_table
 from hoidata.store.mapped import map_npz
 
 FIRST_FRAME = "first_frame"
@@ -21,9 +20,8 @@ REMEDY = "run the stage annotate again"
 
 @dataclass(frozen=True)
 class HandEvidence:
-    """The hand type of a clip and the distances that it follows from."""
+    """The distances of a clip that its hand type follows from."""
 
-    hand_type: HandType | None  # None if neither hand is active
     distance_m: dict[Side, np.ndarray]  # (frame,) closest joint to the object; infinite in invalid frames
     threshold_m: float  # a hand is active below it
     smallest_m: dict[Side, float] | None = None  # exact minimum of each side, if ``distance_m`` is rounded
@@ -38,18 +36,13 @@ class HandEvidence:
         """Return (frame,) bool: whether the hand is closer than the threshold."""
         return self.distance_m[side] < self.threshold_m
 
-    def at_threshold(self, threshold_m: float) -> "HandEvidence":
-        """Return the hand type at another threshold, from the same distances."""
-        hand_type = hand_type_of({side: self.closest_m(side) for side in SIDES}, threshold_m)
-        return HandEvidence(hand_type, self.distance_m, threshold_m, self.smallest_m)
-
-
-def hand_type_of(closest_m: Mapping[Side, float], threshold_m: float) -> HandType | None:
-    """Return the hands that are closer than a threshold; None if neither is."""
-    active: list[HandType] = [side for side in SIDES if closest_m[side] < threshold_m]
-    if len(active) == len(SIDES):
-        return "both"
-    return active[0] if active else None
+    @property
+    def hand_type(self) -> HandType | None:
+        """The hands that are closer than the threshold; None if neither is."""
+        active: list[HandType] = [side for side in SIDES if self.closest_m(side) < self.threshold_m]
+        if len(active) == len(SIDES):
+            return "both"
+        return active[0] if active else None
 
 
 class HandDistances:
@@ -88,19 +81,3 @@ def write_hand_distances(path: Path, evidence: Sequence[HandEvidence]) -> None:
         distances = [np.zeros(0, np.float32), *(item.distance_m[side].astype(np.float32) for item in evidence)]
         arrays[f"{side}_m"] = np.concatenate(distances)
     write_npz(path, arrays)
-
-
-def hand_types_at(annotation: str | Path, threshold_m: float) -> dict[str, HandType | None]:
-    """Return the hand type of each clip of an annotation folder at another threshold, by clip id.
-
-    The result equals that of the stage annotate with this threshold. Raises BadInput unless the threshold is positive.
-    """
-    if not threshold_m > 0:
-        raise BadInput("threshold_m", "metres above 0", repr(threshold_m), "give a length such as 0.02")
-    minima = {side: f"min_{side}_m" for side in SIDES}
-    table = read_table(Path(annotation) / "hand_type.parquet", ["clip_id", *minima.values()])
-    hand_types: dict[str, HandType | None] = {}
-    for clip_id, *values in table.itertuples(index=False):
-        closest: dict[Side, float] = dict(zip(SIDES, (float(value) for value in values), strict=True))
-        hand_types[clip_id] = hand_type_of(closest, threshold_m)
-    return hand_types

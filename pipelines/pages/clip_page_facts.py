@@ -48,7 +48,7 @@ class ClipSeries:
     def surface_evidence(self) -> HandEvidence:
         """The evidence for the hand type from the exact surface in place of sampled points, at the same threshold."""
         distance: dict[Side, np.ndarray] = {side: measured.joint_m for side, measured in self.surface.items()}
-        return HandEvidence(None, distance, self.evidence.threshold_m).at_threshold(self.evidence.threshold_m)
+        return HandEvidence(distance, self.evidence.threshold_m)
 
 
 def sentence_rows(annotated: AnnotatedStore, clip_id: str) -> list[tuple[str, list[str]]]:

@@ -46,7 +46,7 @@ def reversed_in_time(clip: Clip) -> Clip:
 def evidence(near: float = 1.0) -> HandEvidence:
     """The right hand is 1 cm away in the first share ``near`` of the frames and 10 cm in the others."""
     distance: dict[Side, np.ndarray] = {"left": np.full(FRAMES, np.inf), "right": np.where(near >= PHASE, 0.01, 0.1)}
-    return HandEvidence(None, distance, 0.02).at_threshold(0.02)
+    return HandEvidence(distance, 0.02)
 
 
 def verb(clip: Clip, near: float = 1.0) -> str:
@@ -169,7 +169,7 @@ def test_a_frame_is_touched_by_either_hand() -> None:
         "left": np.where(PHASE < 0.5, 0.01, 0.1),
         "right": np.where(PHASE < 0.5, 0.1, 0.01),
     }
-    result = HandEvidence(None, distance, 0.02).at_threshold(0.02)
+    result = HandEvidence(distance, 0.02)
     assert object_motion(HELD, result).touched == 1
     assert derive_verb(HELD, result).verb == "hold"
 

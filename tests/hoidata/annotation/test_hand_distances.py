@@ -15,7 +15,7 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.files.arrays import read_npz, write_npz
 from hoidata.objects.sampling import sample_points
 from hoidata.store.annotated import AnnotatedStore, load_annotated
-from hoidata.store.hand_evidence import HandDistances, HandEvidence, hand_types_at
+from hoidata.store.hand_evidence import HandDistances, HandEvidence
 from tests.builders.clips import clip_of, flat_hand, still_object
 from tests.builders.objects import box_model
 from tests.builders.stores import write_annotated
@@ -74,7 +74,6 @@ def test_another_threshold_gives_what_a_run_of_the_stage_with_it_gives(
         table = pd.read_parquet(tmp_path / f"{threshold_m}" / "hand_type.parquet")
         stored_types = table["hand_type"].astype(object).where(table["hand_type"].notna(), None)
         whole_run = dict(zip(table["clip_id"], stored_types, strict=True))
-        assert hand_types_at(root / "annotation", threshold_m) == whole_run
         judged = {clip_id: annotated.hand_evidence(clip_id, threshold_m).hand_type for clip_id in HEIGHTS_M}
         assert judged == whole_run
         types |= set(whole_run.values())
@@ -90,14 +89,15 @@ def test_a_threshold_just_above_and_at_the_smallest_distance(annotated: Annotate
 
 def test_a_frame_at_the_threshold_is_not_near() -> None:
     distance: dict[Side, np.ndarray] = {"left": np.array([0.02, np.nextafter(0.02, 0)]), "right": np.full(2, np.inf)}
-    assert HandEvidence(None, distance, 0.02).near("left").tolist() == [False, True]
+    assert HandEvidence(distance, 0.02).near("left").tolist() == [False, True]
 
 
 def test_frames_are_judged_one_by_one(annotated: AnnotatedStore) -> None:
     """The right hand is 6.5, 4.5, 2.5, 2.5, 4.5 cm above the box and then lost."""
     evidence = annotated.hand_evidence("toy/s2/2", 0.05)
     assert evidence.near("right").tolist() == [False, True, True, True, True, False]
-    assert evidence.at_threshold(0.03).near("right").tolist() == [False, False, True, True, False, False]
+    closer = annotated.hand_evidence("toy/s2/2", 0.03)
+    assert closer.near("right").tolist() == [False, False, True, True, False, False]
     assert not evidence.near("left").any()
 
 
@@ -124,9 +124,3 @@ def test_an_annotation_without_distances_names_its_stage(root: Path, tmp_path: P
     write_npz(tmp_path / "short.npz", {**arrays, "left_m": arrays["left_m"][:-1]})
     with pytest.raises(BadInput, match="run the stage annotate again"):
         HandDistances(tmp_path / "short.npz", 4)
-
-
-def test_no_length_is_no_threshold(root: Path) -> None:
-    for wrong in (0.0, -0.02, float("nan")):
-        with pytest.raises(BadInput, match="metres above 0"):
-            hand_types_at(root / "annotation", wrong)

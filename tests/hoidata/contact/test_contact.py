@@ -160,7 +160,7 @@ def test_a_hand_acts_below_2_cm_and_not_above(plane, left_m: float, right_m: flo
 def test_another_threshold_needs_no_new_distances(plane) -> None:
     clip, points = plane
     evidence = find_active_hands(clip, hovering(0.012, 0.027), ProximityIndex(points))
-    judged = [evidence.at_threshold(threshold).hand_type for threshold in (0.01, 0.02, 0.03)]
+    judged = [replace(evidence, threshold_m=threshold).hand_type for threshold in (0.01, 0.02, 0.03)]
     assert judged == [None, "left", "both"]
 
 

@@ -43,7 +43,7 @@ def evidence(frames: int, left: slice | None = None, right: slice | None = None)
     distance_m: dict[Side, np.ndarray] = {"left": np.full(frames, 0.1), "right": np.full(frames, 0.1)}
     for side, touched in zip(SIDES, (left, right), strict=True):
         distance_m[side][touched or slice(0, 0)] = 0.01
-    return HandEvidence(None, distance_m, 0.02).at_threshold(0.02)
+    return HandEvidence(distance_m, 0.02)
 
 
 def ends(segments: list[Interval]) -> list[tuple[int, int]]:
