@@ -40,22 +40,19 @@ _FAR_M = 2 * DEEP_M  # farther than any threshold: larger distances need not be 
 # --- motion
 
 
-def accel_paper(pair: Pair, frame_step: int) -> np.ndarray:
+def accel_paper(pair: Pair, _frame_step: int) -> np.ndarray:
     """(hand and frame,) mean length of the second difference over 778 vertices, cm per recorded frame^2."""
-    del frame_step  # a derivative needs every frame
     return 100 * _second_differences_m(pair)[0]
 
 
-def accel_corrected(pair: Pair, frame_step: int) -> np.ndarray:
+def accel_corrected(pair: Pair, _frame_step: int) -> np.ndarray:
     """(hand and frame,) mean acceleration over 778 vertices, m/s^2."""
-    del frame_step
     length_m, step = _second_differences_m(pair)
     return length_m * (FPS / step) ** 2
 
 
-def mul_cm(pairs: Sequence[Pair], frame_step: int) -> Values:
+def mul_cm(pairs: Sequence[Pair], _frame_step: int) -> Values:
     """(pair of motions of one clip,) mean distance of the same vertex in the same frame, cm; unmeasured for one."""
-    del frame_step
     first = pairs[0]
     if len(pairs) == 1:
         return Unmeasured("the clip has one motion")
@@ -294,8 +291,7 @@ def _sound_contact(pair: Pair, moving_part: bool = False) -> np.ndarray:
 def _is_near(hand: HandInObjectFrame, model: ObjectModel, surfaces: dict[int, PartSurface]) -> np.ndarray:
     near = np.zeros(hand.vertices_m.shape[:2], bool)
     for part, surface in surfaces.items():
-        local = model.object_from_part(part, hand.hinge_rad).inverse() @ hand.vertices_m
-        apart = surface.distance_m(np.ascontiguousarray(local.reshape(-1, 3)), NEAR_M)
+        apart = surface.distance_m(_in_part(hand, model, part), NEAR_M)
         near |= (apart <= NEAR_M).reshape(near.shape)
     return near
 
@@ -308,8 +304,7 @@ def placed_hands(pair: Pair) -> list[HandInObjectFrame]:
     for side in pair.sides:
         frames = pair.frames(side)
         local = clip.object.world_from_object.inverse() @ _vertices_m(pair.predicted, side).astype(np.float64)
-        hinge = None if clip.object.hinge_rad is None else clip.object.hinge_rad[frames]
-        faces = pair.predicted.hands[side].faces
+        hinge, faces = pair.predicted.hinge_rad(frames), pair.predicted.hands[side].faces
         hands.append(HandInObjectFrame(local[frames], frames, hinge, faces=faces, n_frames=clip.n_frames))
     return hands
 

@@ -138,7 +138,7 @@ def evaluate_store(
     if encoders:
         skipped_ids = {item.clip_id for item in skipped}
         compared = {
-            clip_id: [(_number(sample, clip_id), sample) for sample in samples[clip_id] if sample not in skipped_ids]
+            clip_id: [(number, sample) for number, sample in samples[clip_id] if sample not in skipped_ids]
             for clip_id in measured
         }
         of_features = encoder_summary(encoders, annotated, store, compared)
@@ -203,8 +203,8 @@ def _ratio(terms: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 def match_predictions(
     predicted_ids: list[str], reference_ids: list[str]
-) -> tuple[dict[str, list[str]], list[SkippedPair]]:
-    """Predicted ids of each reference in the order of their numbers, and predictions without a reference."""
+) -> tuple[dict[str, list[tuple[int, str]]], list[SkippedPair]]:
+    """Number and id of the predictions of each reference, in that order, and predictions without a reference."""
     references = set(reference_ids)
     samples: dict[str, list[tuple[int, str]]] = {}
     skipped: list[SkippedPair] = []
@@ -216,7 +216,7 @@ def match_predictions(
             samples.setdefault(base, []).append((int(number), predicted_id))
         else:
             skipped.append(SkippedPair(predicted_id, "no clip of this part of the split is its reference"))
-    return {reference: [sample for _, sample in sorted(numbered)] for reference, numbered in samples.items()}, skipped
+    return {reference: sorted(numbered) for reference, numbered in samples.items()}, skipped
 
 
 @dataclass(frozen=True)
@@ -250,7 +250,7 @@ class _Evaluator:
     annotated: AnnotatedStore
     store: Store  # of the predictions
     metrics: tuple[Metric, ...]
-    samples: dict[str, list[str]]  # predicted ids by reference id
+    samples: dict[str, list[tuple[int, str]]]  # number and id of the predictions, by reference id
     target_contact: dict[str, np.ndarray]  # by predicted id
     target_distances: dict[str, TargetDistances]  # by predicted id
     actions: Actions
@@ -270,7 +270,7 @@ class _Evaluator:
         skipped: list[SkippedPair] = []
         pairs: list[Pair] = []
         together = [metric for metric in self.metrics if metric.together]
-        for sample in self.samples[clip_id]:
+        for number, sample in self.samples[clip_id]:
             pair = self._pair(reference, sample)
             if isinstance(pair, str):
                 skipped.append(SkippedPair(sample, pair))
@@ -281,7 +281,7 @@ class _Evaluator:
                 if (metric.samples is None or len(measured) < metric.samples) and not metric.together
             ]
             values = {metric.name: _values(metric, pair) for metric in metrics}
-            measured.append(Sample(_number(sample, clip_id), values))
+            measured.append(Sample(number, values))
             pairs += [pair] if together else []  # pairs hold meshes: keep them only for metrics that need all samples
         for metric in together if pairs else ():
             measured[0].values[metric.name] = (
@@ -293,14 +293,18 @@ class _Evaluator:
         """A prediction and its reference, or why they cannot be compared."""
         predicted = stored_motion(self.store, sample)
         target, distances = self.target_contact.get(sample), self.target_distances.get(sample)
+        model = predicted.clip.object.model
+        if not _is_same_mesh(model, reference.motion.clip.object.model):
+            return f"its object {model.name!r} has another mesh, parts or hinge than the reference's"
         find_window = whole_window if self.own_length else window_of
         window = find_window(predicted.clip, reference.motion.clip, reference.sides)
         if isinstance(window, str):
             return window
         if target is not None and target.shape != reference.part.shape:
             return f"the target contact map has {len(target)} points, {len(reference.part)} expected"
-        if distances is not None and (mismatch := _map_mismatch(distances, predicted.clip)):
-            return mismatch
+        n_frames = predicted.clip.n_frames
+        if distances is not None and len(distances.distance_m) != n_frames:
+            return f"the target distance map has {len(distances.distance_m)} frames, not {n_frames}"
         motion, contact = reference.cut(*window)
         return Pair(
             predicted=predicted,
@@ -337,29 +341,14 @@ def _values(metric: Metric, pair: Pair) -> Values:
     return CHOSEN_LENGTH if metric.aligned and not pair.aligned else metric.measure(pair, metric.frame_step)
 
 
-def _map_mismatch(distances: TargetDistances, clip: Clip) -> str:
-    """Why a target distance map does not belong to this clip; "" if it does."""
-    count = len(distances.distance_m)
-    return "" if count == clip.n_frames else f"the target distance map has {count} frames, not {clip.n_frames}"
-
-
-def _number(sample: str, clip_id: str) -> int:
-    """The k of a predicted id ``<reference id>~<k>``, 0 for the bare id."""
-    return int(sample.removeprefix(clip_id).lstrip("~") or 0)
-
-
 def whole_window(predicted: Clip, reference: Clip, sides: tuple[Side, ...]) -> tuple[int, int] | str:
     """All frames of the reference, for a prediction of estimated length; or why they cannot be compared."""
-    if mismatch := _object_mismatch(predicted, reference):
-        return mismatch
     absent = [side for side in sides if not predicted.hands[side].valid.any()]
     return f"the {absent[0]} hand acts and is never valid" if absent else (0, reference.n_frames)
 
 
 def window_of(predicted: Clip, reference: Clip, sides: tuple[Side, ...]) -> tuple[int, int] | str:
     """The frames [start, stop) of the reference that a prediction covers; or why they cannot be compared."""
-    if mismatch := _object_mismatch(predicted, reference):
-        return mismatch
     start = 0
     if predicted.n_frames != reference.n_frames:
         start = _start_in(predicted.source_frames, reference.source_frames)
@@ -371,12 +360,6 @@ def window_of(predicted: Clip, reference: Clip, sides: tuple[Side, ...]) -> tupl
         if (reference.hands[side].valid[slice(*window)] & ~predicted.hands[side].valid).any():
             return f"the {side} hand acts and is not valid in all frames in which the reference has it"
     return window
-
-
-def _object_mismatch(predicted: Clip, reference: Clip) -> str:
-    name = predicted.object.model.name
-    same = _is_same_mesh(predicted.object.model, reference.object.model)
-    return "" if same else f"its object {name!r} has another mesh, parts or hinge than the reference's"
 
 
 def _start_in(part: np.ndarray, whole: np.ndarray) -> int:
@@ -393,13 +376,11 @@ def _start_in(part: np.ndarray, whole: np.ndarray) -> int:
 
 
 def _is_same_mesh(one: ObjectModel, other: ObjectModel) -> bool:
-    if one.faces.shape != other.faces.shape or one.vertices_m.shape != other.vertices_m.shape:
-        return False
-    if (one.hinge is None) != (other.hinge is None):
-        return False
-    if one.hinge is not None and other.hinge is not None:
-        axis = np.abs(one.hinge.axis - other.hinge.axis).max()
-        if max(axis, np.abs(one.hinge.origin_m - other.hinge.origin_m).max()) > SAME_MESH_M:
-            return False
-    same = np.array_equal(one.faces, other.faces) and np.array_equal(one.part, other.part)
-    return same and float(np.abs(one.vertices_m - other.vertices_m).max()) <= SAME_MESH_M
+    arrays, others = (
+        (model.vertices_m, model.faces, model.part, *(model.hinge.arrays if model.hinge else ()))
+        for model in (one, other)
+    )
+    return len(arrays) == len(others) and all(
+        array.shape == like.shape and np.allclose(array, like, rtol=0, atol=SAME_MESH_M)
+        for array, like in zip(arrays, others, strict=True)
+    )

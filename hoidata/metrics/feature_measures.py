@@ -9,6 +9,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from hoidata.metrics.encoded import UNKNOWN, EncodedSet
 from hoidata.metrics.feature_sets import (
@@ -16,7 +17,7 @@ from hoidata.metrics.feature_sets import (
     Comparison,
     FeatureMetricResult,
     cubic_kernel,
-    euclidean,
+    feature_distances,
     fid_paired,
     frechet_distance,
     gaussian,
@@ -25,6 +26,7 @@ from hoidata.metrics.feature_sets import (
     mean_of_pairs,
     mean_result,
     mean_with_itself,
+    pairs_result,
     rows_of_clips,
     set_result,
 )
@@ -144,21 +146,17 @@ def kernel_distance(comparison: Comparison) -> Outcome:
     """Kernel distance over pairs of different clips: predictions and references are paired (Gretton et al. 2012)."""
     recorded_features = comparison.reference.features[rows_of_clips(comparison.clips, comparison.reference)]
 
-    def pairs(run: EncodedSet) -> np.ndarray:
+    def kernel_differences(run: EncodedSet) -> np.ndarray:
         recorded = recorded_features[np.searchsorted(comparison.clips, run.clip)]
         across = cubic_kernel(run.features, recorded)
         return cubic_kernel(run.features, run.features) + cubic_kernel(recorded, recorded) - across - across.T
 
-    runs = [mean_of_pairs(pairs(run), np.ones((1, len(run))))[0] for run in comparison.repetitions]
-    return set_result(comparison, runs, mean_matrix(comparison, pairs), mean_of_pairs)
+    return pairs_result(comparison, kernel_differences)
 
 
 def diversity(comparison: Comparison) -> Outcome:
     """Mean distance over all pairs of clips."""
-    ones = lambda run: np.ones((1, len(run)))  # noqa: E731
-    pairwise = lambda run: euclidean(run.features, run.features)  # noqa: E731
-    runs = [mean_of_pairs(pairwise(run), ones(run))[0] for run in comparison.repetitions]
-    return set_result(comparison, runs, mean_matrix(comparison, pairwise), mean_of_pairs)
+    return pairs_result(comparison, feature_distances)
 
 
 def diversity_released(comparison: Comparison) -> Outcome:
@@ -167,8 +165,7 @@ def diversity_released(comparison: Comparison) -> Outcome:
     for number, run in enumerate(comparison.repetitions):
         one, other = np.random.default_rng([SEED, number]).integers(0, len(run), (2, RELEASED_PAIRS))
         runs.append(np.linalg.norm(run.features[one] - run.features[other], axis=1).mean())
-    matrix = mean_matrix(comparison, lambda run: euclidean(run.features, run.features))
-    return set_result(comparison, runs, matrix, mean_with_itself)
+    return set_result(comparison, runs, mean_matrix(comparison, feature_distances), mean_with_itself)
 
 
 def mean_within_labels(distances: np.ndarray, label: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -190,12 +187,16 @@ def mean_within_labels(distances: np.ndarray, label: np.ndarray, weights: np.nda
 def multimodality_by_label(comparison: Comparison) -> Outcome:
     """Mean distance within a true label, over labels of at least two clips."""
     label = comparison.reference.label[rows_of_clips(comparison.clips, comparison.reference)]
-    pairwise = lambda run: euclidean(run.features, run.features)  # noqa: E731
-    runs = [mean_within_labels(pairwise(run), run.label, np.ones((1, len(run))))[0] for run in comparison.repetitions]
+    runs = [
+        mean_within_labels(feature_distances(run), run.label, np.ones((1, len(run))))[0]
+        for run in comparison.repetitions
+    ]
     single = int((np.unique(label[label != UNKNOWN], return_counts=True)[1] == 1).sum())
     note = f"{single} label{'s' * (single > 1)} of one clip left out" if single else ""
     statistic = lambda matrix, weights: mean_within_labels(matrix, label, weights)  # noqa: E731
-    return set_result(comparison, runs, mean_matrix(comparison, pairwise), statistic, note, "no label has two clips")
+    return set_result(
+        comparison, runs, mean_matrix(comparison, feature_distances), statistic, note, "no label has two clips"
+    )
 
 
 def multimodality_released(comparison: Comparison) -> Outcome:
@@ -223,20 +224,8 @@ def multimodality_by_prompt(comparison: Comparison) -> Outcome:
     for clip in comparison.clips:
         rows = np.flatnonzero(predicted.clip == clip)
         if len(rows) > 1:
-            features = predicted.features[rows]
-            values[rows] = mean_of_pairs(euclidean(features, features), np.ones((1, len(rows))))[0]
+            values[rows] = mean_of_pairs(feature_distances(predicted.take(rows)), np.ones((1, len(rows))))[0]
     return mean_result(comparison, values, by_repetition=False, without="the clip has one motion")
-
-
-def ranks(distance: np.ndarray, is_match: np.ndarray) -> np.ndarray:
-    """(motion,) number of wrong sentences that are at least as close as the closest matching sentence.
-
-    Args:
-        distance: (motion, sentence) distances in the shared feature space.
-        is_match: (motion, sentence) bool; every sentence with the same prompt matches, so a duplicate is a hit.
-    """
-    nearest = np.where(is_match, distance, np.inf).min(axis=1)
-    return ((distance <= nearest[:, None]) & ~is_match).sum(axis=1)
 
 
 class Groups(NamedTuple):
@@ -268,8 +257,8 @@ def sentence_ranks(comparison: Comparison, hard: bool) -> Groups:
         if len(others):
             sentences = np.concatenate((predicted.text[motion][None], texts[others]))
             distance = np.linalg.norm(sentences - predicted.features[motion], axis=1)
-            is_match = np.arange(len(sentences)) == 0
-            ranks_and_sizes[:, motion] = ranks(distance[None], is_match[None])[0], len(sentences)
+            closer = distance[1:] <= distance[0]  # a tie is a miss
+            ranks_and_sizes[:, motion] = closer.sum(), len(sentences)
     return Groups(*ranks_and_sizes)
 
 
@@ -317,6 +306,6 @@ def memorised(comparison: Comparison) -> Outcome:
     if comparison.train is None:
         return NO_TRAINING
     sets, train = (comparison.predicted, comparison.reference), comparison.train.features
-    distance, recorded_distance = (euclidean(encoded.features, train).min(axis=1) for encoded in sets)
+    distance, recorded_distance = (cdist(encoded.features, train).min(axis=1) for encoded in sets)
     is_close = distance < MEMORISED_BELOW * recorded_distance[comparison.reference_rows]
     return mean_result(comparison, is_close.astype(float))

@@ -5,7 +5,7 @@ generated from it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from hoidata.metrics.encoded import EncodedSet, Encoder, EncoderInput, encode_sets, recorded_motions, stored_motion
@@ -37,7 +37,7 @@ from hoidata.metrics.feature_measures import (
 from hoidata.metrics.feature_sets import TOO_SMALL, Comparison, FeatureMetricResult, fid_frechet, kid
 from hoidata.metrics.pair import acting_sides
 from hoidata.metrics.paths import PathEncoder
-from hoidata.metrics.registry import OWN, Direction
+from hoidata.metrics.registry import OWN, RankedMetric
 from hoidata.metrics.unmeasured import Unmeasured
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import Store
@@ -45,21 +45,12 @@ from hoidata.store.store import Store
 DIGITS = 6
 
 
-@dataclass(frozen=True)
-class FeatureMetric:
-    """A metric of the features of one encoder; the other fields are those of ``registry.Metric``."""
+@dataclass(frozen=True, kw_only=True)
+class FeatureMetric(RankedMetric):
+    """A metric of the features of one encoder; ``measure`` maps a ``Comparison`` to one result."""
 
-    name: str
-    measure: Measure
-    _: KW_ONLY
-    title: str
-    unit: str = ""
-    direction: Direction
-    encoder: str
-    reduction: str
-    source: str
-    thresholds: str = ""
-    floor_of: str = ""
+    encoder: str  # its name
+    reduction: str  # how values become one result, in words
     note: str = ""  # a remark for readers of the value
 
     @property

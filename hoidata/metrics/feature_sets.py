@@ -119,6 +119,19 @@ def set_result(
     return FeatureMetricResult(value, *counts, repetitions=t_interval(runs), bootstrap=over_clips, note=note)
 
 
+def pairs_result(
+    comparison: Comparison, matrix_of: Callable[[EncodedSet], np.ndarray]
+) -> FeatureMetricResult | Unmeasured:
+    """The mean over all pairs of different clips of each repetition's (motion, motion) matrix, with intervals."""
+    runs = [mean_of_pairs(matrix_of(run), np.ones((1, len(run))))[0] for run in comparison.repetitions]
+    return set_result(comparison, runs, mean_matrix(comparison, matrix_of), mean_of_pairs)
+
+
+def feature_distances(encoded: EncodedSet) -> np.ndarray:
+    """(motion, motion) Euclidean distances of the features."""
+    return cdist(encoded.features, encoded.features)
+
+
 def mean_matrix(comparison: Comparison, matrix_of: Callable[[EncodedSet], np.ndarray]) -> np.ndarray:
     """(clip, clip) mean over the repetitions of each one's (motion, motion) matrix."""
     total = np.zeros((len(comparison.clips),) * 2)
@@ -186,11 +199,6 @@ def kid(one: np.ndarray, other: np.ndarray) -> float:
         return np.nan
     same = [mean_of_pairs(cubic_kernel(rows, rows), np.ones((1, len(rows))))[0] for rows in (one, other)]
     return float(sum(same) - 2 * cubic_kernel(one, other).mean())
-
-
-def euclidean(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(row, other row) Euclidean distances."""
-    return cdist(one, other)
 
 
 def mean_of_pairs(matrix: np.ndarray, weights: np.ndarray) -> np.ndarray:

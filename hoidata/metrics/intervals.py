@@ -43,7 +43,6 @@ def bootstrap_interval(
     groups: ArrayLike,
     statistic: Statistic = weighted_mean,
     resamples: int = RESAMPLES,
-    seed: int = SEED,
     centre: float | None = None,
 ) -> Interval | None:
     """Bootstrap percentile interval, resampling whole groups of clips with replacement; None for one group.
@@ -58,7 +57,7 @@ def bootstrap_interval(
     values, (names, group) = np.asarray(values_by_clip), np.unique(np.asarray(groups), return_inverse=True)
     if len(names) < 2:
         return None
-    counts = np.random.default_rng(seed).multinomial(len(names), np.full(len(names), 1 / len(names)), size=resamples)
+    counts = np.random.default_rng(SEED).multinomial(len(names), np.full(len(names), 1 / len(names)), size=resamples)
     chunk = max(1, MOST_WEIGHTS // len(group))
     chunks = [counts[start : start + chunk, group].astype(np.float64) for start in range(0, resamples, chunk)]
     results = np.concatenate([statistic(values, weights) for weights in chunks])

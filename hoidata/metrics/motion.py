@@ -1,6 +1,7 @@
 """Metrics of one motion: joint error, smoothness, action, length, and the physical realism of ManipNet.
 
 Each function returns the values of one motion, or why it has none. Physical realism needs gravity and a lifted object.
+Derivatives use every frame, whatever the frame step.
 """
 
 from functools import lru_cache
@@ -29,9 +30,8 @@ def joint_error_mm(pair: Pair, frame_step: int) -> np.ndarray:
     return 1000 * _concatenated(errors_m)
 
 
-def smoothness(pair: Pair, frame_step: int) -> np.ndarray:
+def smoothness(pair: Pair, _frame_step: int) -> np.ndarray:
     """(hand,) mean acceleration of the joints in the wrist's frame, m/s^2; needs three successive valid frames."""
-    del frame_step  # a derivative needs every frame
     accelerations = []
     for side in pair.sides:
         joints = _visible_joints(pair, side)
@@ -41,9 +41,8 @@ def smoothness(pair: Pair, frame_step: int) -> np.ndarray:
     return np.array(accelerations)
 
 
-def jitter_m_s3(pair: Pair, frame_step: int) -> np.ndarray:
+def jitter_m_s3(pair: Pair, _frame_step: int) -> np.ndarray:
     """(hand and frame,) mean over the joints of the third difference (jerk) of world positions, m/s^3."""
-    del frame_step  # a derivative needs every frame
     jitters = []
     for side in pair.sides:
         third = np.linalg.norm(np.diff(_visible_joints(pair, side), n=3, axis=0), axis=-1).mean(axis=-1) * FPS**3
@@ -51,16 +50,14 @@ def jitter_m_s3(pair: Pair, frame_step: int) -> np.ndarray:
     return _concatenated(jitters)
 
 
-def object_jitter_m_s3(pair: Pair, frame_step: int) -> np.ndarray:
+def object_jitter_m_s3(pair: Pair, _frame_step: int) -> np.ndarray:
     """(frame,) third difference (jerk) of the world position of the object's centre, m/s^3."""
-    del frame_step  # a derivative needs every frame
     third = np.diff(object_middle_m(pair.predicted.clip.object).astype(np.float64), n=3, axis=0)
     return np.linalg.norm(third, axis=-1) * FPS**3
 
 
-def length_error_frames(pair: Pair, frame_step: int) -> Values:
+def length_error_frames(pair: Pair, _frame_step: int) -> Values:
     """(1,) absolute error of an estimated length, frames; unmeasured if the length was given."""
-    del frame_step
     wrong = abs(pair.predicted.clip.n_frames - pair.reference.clip.n_frames)
     return Unmeasured("the length was given") if pair.aligned else np.array([float(wrong)])
 
@@ -71,9 +68,8 @@ def length_error_share(pair: Pair, frame_step: int) -> Values:
     return wrong if isinstance(wrong, Unmeasured) else wrong / pair.reference.clip.n_frames
 
 
-def action_followed(pair: Pair, frame_step: int) -> Values:
+def action_followed(pair: Pair, _frame_step: int) -> Values:
     """(1,) 1 if the object's motion satisfies the rules of the verb, else 0; unmeasured for a verb without rules."""
-    del frame_step
     if pair.verb is None:
         return NO_VERB
     if pair.actions is None or pair.verb not in pair.actions.limits:
@@ -82,9 +78,8 @@ def action_followed(pair: Pair, frame_step: int) -> Values:
     return NO_GRAVITY if followed is None else np.array([float(followed)])
 
 
-def action_named(pair: Pair, frame_step: int) -> Values:
+def action_named(pair: Pair, _frame_step: int) -> Values:
     """(1,) 1 if the nearest centroid of training clips belongs to the requested verb, else 0."""
-    del frame_step
     if pair.verb is None:
         return NO_VERB
     if pair.actions is None or pair.verb not in pair.actions.centroids:
@@ -114,35 +109,35 @@ def _concatenated(arrays: list[np.ndarray]) -> np.ndarray:
 
 def realism_si(pair: Pair, frame_step: int) -> Values:
     """(scored frame,) 1 where friction forces at the contacts explain the object's motion, in SI units."""
-    return _explained(pair, "SI", frame_step)
+    return _passed(_realism(pair, "SI", frame_step))
 
 
 def realism_as_released(pair: Pair, frame_step: int) -> Values:
     """(scored frame,) as ``realism_si``, with the units of ManipNet's released code."""
-    return _explained(pair, "as released", frame_step)
+    return _passed(_realism(pair, "as released", frame_step))
 
 
 def floor_si(pair: Pair, frame_step: int) -> Values:
     """(lifted frame,) as ``realism_si`` without hands: 1 only in free fall. Lower bound of the metric."""
-    return _floor(pair, "SI", frame_step)
+    return _passed(_scored(_without_hands(pair), "SI", frame_step))
 
 
 def floor_as_released(pair: Pair, frame_step: int) -> Values:
     """(lifted frame,) as ``realism_as_released`` without hands."""
-    return _floor(pair, "as released", frame_step)
+    return _passed(_scored(_without_hands(pair), "as released", frame_step))
 
 
 def realism_every_frame(pair: Pair, frame_step: int) -> Values:
     """(frame,) 1 where contact forces of hands and table explain the object's motion and no hand is deep inside it."""
-    return _passes(pair.scene, frame_step)
+    return _every_frame(pair.scene, frame_step)
 
 
 def floor_every_frame(pair: Pair, frame_step: int) -> Values:
     """(frame,) as ``realism_every_frame`` without hands: 1 where the object rests on the table or falls."""
-    return _passes(_without_hands(pair), frame_step)
+    return _every_frame(_without_hands(pair), frame_step)
 
 
-def _passes(scene: Scene | Unmeasured, frame_step: int) -> Values:
+def _every_frame(scene: Scene | Unmeasured, frame_step: int) -> Values:
     if isinstance(scene, Unmeasured):
         return scene
     return every_frame_passes(scene, _every_nth(np.ones(scene.n_frames, bool), frame_step)).astype(np.float64)
@@ -158,29 +153,24 @@ def capsule_depth_mm(pair: Pair, frame_step: int) -> Values:
     return np.array([1000 * realism.colliding_m])
 
 
-def _explained(pair: Pair, variant: str, frame_step: int) -> Values:
-    realism = _realism(pair, variant, frame_step)
+def _passed(realism: Realism | Unmeasured) -> Values:
     return realism if isinstance(realism, Unmeasured) else realism.passed.astype(np.float64)
-
-
-def _floor(pair: Pair, variant: str, frame_step: int) -> Values:
-    bare = _without_hands(pair)
-    if isinstance(bare, Unmeasured):
-        return bare
-    return score(bare, VARIANTS[variant], _every_nth(bare.lifted, frame_step)).passed.astype(np.float64)
 
 
 @lru_cache(maxsize=1)
 def _without_hands(pair: Pair) -> Scene | Unmeasured:
     scene = pair.scene
-    return (
-        scene if isinstance(scene, Unmeasured) else scene.with_capsules(scene.capsules.taken(slice(None), slice(0, 0)))
-    )
+    if isinstance(scene, Unmeasured):
+        return scene
+    return scene.with_capsules(scene.capsules.taken(slice(None), slice(0, 0)))
 
 
 @lru_cache(maxsize=2)
 def _realism(pair: Pair, variant: str, frame_step: int) -> Realism | Unmeasured:
-    scene = pair.scene
+    return _scored(pair.scene, variant, frame_step)
+
+
+def _scored(scene: Scene | Unmeasured, variant: str, frame_step: int) -> Realism | Unmeasured:
     if isinstance(scene, Unmeasured):
         return scene
     return score(scene, VARIANTS[variant], _every_nth(scene.lifted, frame_step))

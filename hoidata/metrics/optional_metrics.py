@@ -3,8 +3,7 @@
 To add one: entries of ``registry.Metric`` with new names, and the name of the list in ``OPTIONAL_LISTS``.
 """
 
-from collections.abc import Callable, Iterable, Mapping
-from types import MappingProxyType
+from collections.abc import Callable, Iterable
 
 from hoidata.errors import BadInput
 from hoidata.metrics import bimart
@@ -105,7 +104,7 @@ BIMART_METRICS: tuple[Metric, ...] = (
     ),
 )  # fmt: skip
 
-OPTIONAL_LISTS: Mapping[str, tuple[Metric, ...]] = MappingProxyType({"bimart": BIMART_METRICS})
+OPTIONAL_LISTS = {"bimart": BIMART_METRICS}
 
 
 def select_metrics(names: Iterable[str]) -> tuple[Metric, ...]:

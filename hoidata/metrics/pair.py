@@ -92,14 +92,11 @@ class Pair:
             return Unmeasured("the motion has fewer than three frames")
         if not surface_index(clip.object.model).is_solid:
             return NO_INSIDE
-        hands = {side: replace(track, valid=self._present(side)) for side, track in clip.hands.items()}
+        hands = {
+            side: replace(track, valid=self.valid(side) & (side in self.sides)) for side, track in clip.hands.items()
+        }
         gravity = self.reference.clip.gravity
         return clip_scene(replace(clip, hands=hands, gravity=gravity), self.predicted.hands, self.table_m)
-
-    def _present(self, side: Side) -> np.ndarray:
-        """(frame,) bool: the hand acts and is measured."""
-        valid = self.valid(side)
-        return valid if side in self.sides else np.zeros_like(valid)
 
 
 def acting_sides(hand_type: str) -> tuple[Side, ...]:

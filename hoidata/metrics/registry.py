@@ -7,7 +7,7 @@ request.
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -25,25 +25,31 @@ OWN = "this project"
 
 
 @dataclass(frozen=True)
-class Metric:
-    """How one metric is measured on a motion, reduced over motions, ranked and described."""
+class RankedMetric:
+    """How a metric, of motions or of features, is measured, ranked and described."""
 
     name: str  # key in metrics files
-    measure: Callable[..., Values]  # (pair, frame_step): the values of one motion, or why it has none
+    measure: Callable[..., Any]  # Metric: (pair, frame_step); FeatureMetric: (comparison)
     _: KW_ONLY
-    topic: Topic  # tables are grouped by topic
     title: str  # column header
     unit: str = ""  # "" for a fraction or a score from 0 to 1
     direction: Direction  # which values are better; "closer to recorded": than the value of the recorded clips
+    source: str = OWN  # where the definition comes from
+    thresholds: str = ""  # in words
+    floor_of: str = ""  # the metric whose lower bound this is; bounds are not ranked
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metric(RankedMetric):
+    """A metric of motions; ``measure`` gives the values of one motion, or why it has none."""
+
+    topic: Topic  # tables are grouped by topic
     # "best of a clip's samples" and "mean over motions" take the mean of each motion's values first;
     # "mean over frames" pools all values of all motions.
     reduction: Reduction = "mean over motions"
     frames: str = HANDS  # which frames are measured, in words
-    source: str = OWN  # where the definition comes from
     frame_step: int = 1  # every n-th of these frames is measured
     samples: int | None = None  # how many motions of a clip are measured; None: all
-    thresholds: str = ""  # in words
-    floor_of: str = ""  # the metric whose lower bound this is; bounds are not ranked
     aligned: bool = False  # compares frame by frame, so motions of estimated length have no value
     together: bool = False  # ``measure`` gets the pairs of all motions of a clip in a list, not one pair
 
@@ -255,16 +261,7 @@ def sum_and_count(metric: Metric, samples: list[Values]) -> tuple[float, int]:
     return sum(means), len(means)
 
 
-class Ranked(Protocol):
-    """The fields of a metric, geometric or of features, that ``is_better`` reads."""
-
-    @property
-    def direction(self) -> Direction: ...
-    @property
-    def floor_of(self) -> str: ...
-
-
-def is_better(metric: Ranked, value: float, other: float, recorded: float | None) -> bool | None:
+def is_better(metric: RankedMetric, value: float, other: float, recorded: float | None) -> bool | None:
     """Whether ``value`` is better than ``other``; None for lower bounds and if a needed recorded value is missing.
 
     Args:

@@ -26,32 +26,28 @@ TOO_LARGE = Unmeasured("the object is too large for a lattice of lines")
 CELL_M = 0.002  # spacing of the lines along which volumes are integrated: an error of about 1 % of the volume
 
 
-def contact_f1(pair: Pair, frame_step: int) -> np.ndarray:
+def contact_f1(pair: Pair, _frame_step: int) -> np.ndarray:
     """(1,) F1 of the generated contact map against that of the reference; 1 if both are empty."""
-    del frame_step  # a contact map covers all frames
     return np.array([f1_score(*_maps(pair))])
 
 
-def contact_precision(pair: Pair, frame_step: int) -> np.ndarray:
+def contact_precision(pair: Pair, _frame_step: int) -> np.ndarray:
     """(1,) fraction of the generated contact points that the reference touches too.
 
     A motion without contact scores 0 if the reference has contact and 1 if it has none.
     """
-    del frame_step
     touched, reference = _maps(pair)
     return _fraction(touched & reference, touched, reference)
 
 
-def contact_recall(pair: Pair, frame_step: int) -> np.ndarray:
+def contact_recall(pair: Pair, _frame_step: int) -> np.ndarray:
     """(1,) fraction of the reference's contact points that the motion touches too; empty maps as in precision."""
-    del frame_step
     touched, reference = _maps(pair)
     return _fraction(touched & reference, reference, touched)
 
 
-def adherence(pair: Pair, frame_step: int) -> Values:
+def adherence(pair: Pair, _frame_step: int) -> Values:
     """(1,) F1 of the generated contact map against the target map; unmeasured without a target."""
-    del frame_step
     if pair.target_contact is None:
         return Unmeasured("the motion was made without a target contact map")
     return np.array([f1_score(touched_points(pair), pair.target_contact)])
@@ -84,9 +80,8 @@ def contact_entries(pair: Pair) -> dict[Side, np.ndarray]:
     }
 
 
-def slip_cm_s(pair: Pair, frame_step: int) -> np.ndarray:
+def slip_cm_s(pair: Pair, _frame_step: int) -> np.ndarray:
     """(joint and frame,) slip speed of touching joints of the acting hands, cm/s (``joint_slips_cm_s``)."""
-    del frame_step  # a speed needs every frame
     clip, slips = pair.predicted.clip, [np.zeros(0)]
     for side, near in contact_entries(pair).items():
         part = pair.contact.part[near["point"]]

@@ -194,16 +194,6 @@ def test_clips_of_one_source_sequence_are_resampled_together():
     assert intervals_of(metric("jitter_m_s3"), together[:2]) == {}
 
 
-def test_intervals_contain_the_value_of_their_metric(write_annotated, moved, tmp_path):
-    root, clips = write_annotated()
-    predicted = [named(moved(c, (0, 0.01 * k, 0)), f"{c.clip_id}~{k}") for c in clips.values() for k in range(3)]
-    evaluation = evaluate_store(written(tmp_path / "three", predicted), root)
-    assert set(evaluation["intervals"]) <= set(evaluation["figures"])
-    for name, ends in evaluation["intervals"].items():
-        for low, high in ends.values():
-            assert low - 1e-6 <= evaluation["figures"][name] <= high + 1e-6, name
-
-
 @pytest.mark.slow
 def test_results_do_not_depend_on_the_number_of_processes(write_annotated, moved, tmp_path, monkeypatch):
     monkeypatch.setattr("hoidata.metrics.evaluate.WORKERS_PAY_FROM", 0)
@@ -271,7 +261,7 @@ def test_a_motion_has_the_verb_of_its_reference_and_the_limits_are_reported(writ
 def test_samples_are_taken_in_the_order_of_their_numbers():
     ids = ["a~10", "a~2", "b~0", "a", "b~x", "c"]
     samples, skipped = match_predictions(ids, ["a", "b"])
-    assert samples == {"a": ["a", "a~2", "a~10"], "b": ["b~0"]}
+    assert samples == {"a": [(0, "a"), (2, "a~2"), (10, "a~10")], "b": [(0, "b~0")]}
     assert [item.clip_id for item in skipped] == ["b~x", "c"]
 
 
@@ -298,10 +288,11 @@ def test_better_follows_the_registered_direction():
 
 
 def test_every_metric_is_registered_once_and_floors_have_their_metric():
-    names = [item.name for item in METRICS]
-    assert len(set(names)) == len(names) == len({item.title for item in METRICS})
-    assert {item.floor_of for item in METRICS if item.floor_of} <= set(names)
-    assert {item.direction for item in METRICS} <= set(get_args(registry.Direction))
+    metrics = select_metrics(["bimart"])
+    names = [item.name for item in metrics]
+    assert len(set(names)) == len(names) == len({item.title for item in metrics})
+    assert {item.floor_of for item in metrics if item.floor_of} <= set(names)
+    assert {item.direction for item in metrics} <= set(get_args(registry.Direction))
 
 
 def test_the_readme_is_generated_from_the_registry():

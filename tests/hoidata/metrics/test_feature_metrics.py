@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from hoidata.metrics.encoded import UNKNOWN, EncodedSet
-from hoidata.metrics.feature_measures import ranks
 from hoidata.metrics.feature_metrics import FEATURE_METRICS, feature_results
 from hoidata.metrics.feature_sets import TOO_SMALL, FeatureMetricResult, fid_frechet, fid_paired, frechet_distance, kid
 from hoidata.metrics.unmeasured import Unmeasured
@@ -68,16 +67,6 @@ def test_equal_sets_have_no_distance_and_a_shift_counts_squared():
     one = normal(64)
     assert fid_frechet(one, one) == pytest.approx(0, abs=1e-9)
     assert fid_frechet(one, one + 2.0) == pytest.approx(4 * 4)
-
-
-def test_the_distance_of_halves_of_a_gaussian_shrinks_with_size_as_in_theory():
-    size, results = 8, {}
-    for rows in (64, 256, 1024):
-        draws = [fid_frechet(normal(rows, size, seed), normal(rows, size, 1000 + seed)) for seed in range(30)]
-        results[rows] = np.mean(draws)
-        # Leading order in 1 / N: 2 tr C / N of the means, D (D + 1) / 2 N of the covariances.
-        assert results[rows] == pytest.approx((2 * size + size * (size + 1) / 2) / rows, rel=0.15)
-    assert results[64] > 3 * results[256] > 9 * results[1024]
 
 
 def test_a_frechet_distance_below_four_clips_per_feature_is_refused_with_a_reason():
@@ -167,12 +156,6 @@ def test_accuracy_counts_ties_as_misses_and_skips_untrained_labels():
     assert results["accuracy_top3_corrected"].value == 1
 
 
-def test_a_duplicate_sentence_is_a_hit_and_a_tie_with_another_sentence_is_a_miss():
-    distance = np.array([[0.5, 0.1, 0.9], [0.5, 0.1, 0.9], [0.1, 0.1, 0.9]])
-    is_match = np.array([[True, True, False], [True, False, False], [True, False, False]])
-    assert ranks(distance, is_match).tolist() == [0, 1, 1]
-
-
 def with_text(features, text, **changes) -> EncodedSet:
     return encoded(
         features, encoder="text-motion", text=np.asarray(text), logits=np.zeros((len(features), 0)), **changes
@@ -202,6 +185,11 @@ def test_groups_have_distinct_sentences_and_shrink_if_there_are_fewer():
     assert results["r_precision_top1_text_motion"].value == 1
     assert results["r_precision_top1_floor_text_motion"].value == pytest.approx(1 / 5)
     assert results["r_precision_top1_text_motion"].note == "groups of 5"
+
+
+def test_a_tie_with_another_sentence_is_a_miss():
+    motions = with_text(normal(8, 6), np.ones((8, 6)))
+    assert measured_features(motions, motions)["r_precision_top3_text_motion"].value == 0
 
 
 def test_hard_groups_have_sentences_about_the_same_object():
