@@ -84,7 +84,7 @@ def clip_row(clip: Clip, facts: ObjectFacts, hands: HandPair, thresholds: Thresh
         **_frozen(clip, joints, corners),
         **_penetration(clip, facts, hands, thresholds),
         **_offset(clip, joints, facts, thresholds),
-        "largest_beta": max((largest_beta(meant_betas(clip.hands[side])) for side in tracked), default=NAN),
+        "largest_beta": max((float(np.abs(meant_betas(clip.hands[side])).max()) for side in tracked), default=NAN),
         "seam_triangles": facts.model.seam_triangles,
         "gap_share": max(motion.gap_share(flags) for flags in valid.values()),
         "handless_share": float((~(valid["left"] | valid["right"])).mean()),
@@ -203,11 +203,6 @@ def _offset(clip: Clip, joints: Joints, facts: ObjectFacts, thresholds: Threshol
 def meant_betas(track: HandTrack) -> np.ndarray:
     """Return (row, 10) betas of the valid frames."""
     return track.betas if len(track.betas) == 1 else track.betas[track.valid]
-
-
-def largest_beta(betas: np.ndarray) -> float:
-    """Return the largest ``|beta|`` of (row, 10), standard deviations; 0 for a personal template."""
-    return float(np.abs(betas).max())
 
 
 def distances_to_others(betas: Mapping[str, np.ndarray]) -> dict[str, float]:

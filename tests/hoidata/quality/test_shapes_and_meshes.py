@@ -6,7 +6,7 @@ import trimesh
 
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.solid import NoSolid, Solid, solid_of
-from hoidata.quality.measures import distances_to_others, largest_beta
+from hoidata.quality.measures import distances_to_others
 from hoidata.quality.meshes import part_facts, surface_facts
 from tests.builders.objects import box_model, two_parts
 
@@ -15,11 +15,6 @@ BOX = trimesh.creation.box((0.1, 0.2, 0.3))
 
 def is_solid(faces: np.ndarray) -> bool:
     return isinstance(solid_of(BOX.vertices, faces), Solid)
-
-
-def test_largest_beta_counts_either_way():
-    assert largest_beta(np.array([[0.5, -2.5, 1.0]])) == 2.5
-    assert largest_beta(np.zeros((1, 10))) == 0
 
 
 def test_clip_of_another_shape_than_its_subjects_other_clips_stands_out():

@@ -1,10 +1,7 @@
 """The stage's folder: verdicts, reasons, a row per clip and object, equal bytes; real and generated recordings."""
 
 import json
-import multiprocessing
 import os
-import threading
-import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -44,6 +41,18 @@ def lost(clip: Clip, value: float, frames: slice) -> Clip:
     return replace(clip, hands={**clip.hands, "right": replace(track, betas=betas, valid=valid)})
 
 
+def clips_of_one_subject(make_clip, count: int, beta: float, subject: str = "s1") -> list[Clip]:
+    ids = [f"test/{subject}/{number}" for number in range(count)]
+    return [with_betas(make_clip(FRAMES, seed=3, clip_id=clip_id, subject=subject), beta) for clip_id in ids]
+
+
+def measured(folder: Path, clips: list[Clip]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The tables of the stage for a store of these clips."""
+    write_clips(folder / "clips", clips)
+    quality_store(folder / "clips", folder / "quality", progress=False)
+    return tables(folder / "quality")
+
+
 def of_open_box(clip: Clip) -> Clip:
     model = replace(clip.object.model, name="open_box", faces=clip.object.model.faces[1:])
     return replace(clip, object=replace(clip.object, model=model))
@@ -52,7 +61,7 @@ def of_open_box(clip: Clip) -> Clip:
 @pytest.fixture
 def clips_folder(make_clip, tmp_path) -> Path:
     """Four clips of one subject, of which one jumps, one has another shape and one an open mesh."""
-    clips = [with_betas(make_clip(FRAMES, seed=3, clip_id=f"test/s1/{number}"), 0.3) for number in range(5)]
+    clips = clips_of_one_subject(make_clip, 5, 0.3)
     clips[1], clips[2], clips[3] = jumping(clips[1], 30, 0.5), with_betas(clips[2], -1.7), of_open_box(clips[3])
     write_clips(tmp_path / "clips", clips)
     return tmp_path / "clips"
@@ -97,9 +106,7 @@ def test_penetration_is_measured_in_an_object_divided_by_part_labels(make_clip, 
         name="divided", vertices_m=np.array(mesh.vertices), faces=np.array(mesh.faces), part=part, hinge=hinge
     )
     track = replace(clip.object, model=model, hinge_rad=np.zeros(FRAMES, np.float32))
-    write_clips(tmp_path / "clips", [replace(clip, object=track)])
-    quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
-    clips, meshes = tables(tmp_path / "quality")
+    clips, meshes = measured(tmp_path, [replace(clip, object=track)])
     assert clips["note"].tolist() == [""]
     assert clips["penetration_m"].notna().all()
     assert clips["seam_triangles"].tolist() == meshes["seam_triangles"].tolist() == [model.seam_triangles]
@@ -132,59 +139,28 @@ def test_worker_processes_change_no_byte(clips_folder, tmp_path, monkeypatch):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
 
 
-@pytest.mark.long
-def test_a_worker_killed_once_changes_no_byte(clips_folder, tmp_path, monkeypatch):
-    quality_store(clips_folder, tmp_path / "one", jobs=1, progress=False)
-    monkeypatch.setattr(stage, "FRAMES_PER_JOB", 1)
-    killer = threading.Thread(target=kill_a_worker)
-    killer.start()
-    quality_store(clips_folder, tmp_path / "two", jobs=2, progress=False)
-    killer.join()
-    assert (tmp_path / "one" / "clips.parquet").read_bytes() == (tmp_path / "two" / "clips.parquet").read_bytes()
-    assert not multiprocessing.active_children()
-
-
-def kill_a_worker() -> None:
-    """As the system does when memory runs out; the first one that is started, before it has done anything."""
-    while not (workers := multiprocessing.active_children()):
-        time.sleep(0.001)
-    workers[0].kill()
-
-
 def test_personal_templates_have_no_shape_to_compare(make_clip, tmp_path):
-    clips = [with_betas(make_clip(FRAMES, seed=3, clip_id=f"test/s1/{number}"), 0.0) for number in range(4)]
     template = load_embedded_hands()["right"].template_m
     clips = [
         replace(clip, hands={side: replace(track, template_m=template) for side, track in clip.hands.items()})
-        for clip in clips
+        for clip in clips_of_one_subject(make_clip, 4, 0.0)
     ]
-    write_clips(tmp_path / "clips", clips)
-    quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
-    rows, _ = tables(tmp_path / "quality")
+    rows, _ = measured(tmp_path, clips)
     assert rows["beta_distance"].isna().all()
     assert rows["largest_beta"].tolist() == [0, 0, 0, 0]
 
 
 def test_a_shape_is_compared_with_clips_of_the_same_subject_only(make_clip, tmp_path):
     """Two subjects of different hands, three clips each."""
-    shapes = {"s1": 0.9, "s2": -0.9}
-    clips = [
-        with_betas(make_clip(FRAMES, seed=3, clip_id=f"test/{who}/{number}", subject=who), shape)
-        for who, shape in shapes.items()
-        for number in range(3)
-    ]
-    write_clips(tmp_path / "clips", clips)
-    quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
-    rows, _ = tables(tmp_path / "quality")
+    clips = clips_of_one_subject(make_clip, 3, 0.9) + clips_of_one_subject(make_clip, 3, -0.9, "s2")
+    rows, _ = measured(tmp_path, clips)
     assert rows["beta_distance"].tolist() == pytest.approx([0.0] * 6, abs=1e-6)
 
 
 def test_shapes_of_frames_without_the_hand_are_not_read(make_clip, tmp_path):
-    clips = [with_betas(make_clip(FRAMES, seed=3, clip_id=f"test/s1/{number}"), 0.3) for number in range(4)]
+    clips = clips_of_one_subject(make_clip, 4, 0.3)
     clips[2] = lost(clips[2], 50.0, slice(10, 50))
-    write_clips(tmp_path / "clips", clips)
-    quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
-    rows, _ = tables(tmp_path / "quality")
+    rows, _ = measured(tmp_path, clips)
     assert rows["largest_beta"].tolist() == pytest.approx([0.3] * 4)
     assert rows["beta_distance"].tolist() == pytest.approx([0.0] * 4, abs=1e-6)
 
@@ -218,9 +194,7 @@ def test_no_clip_of_a_generated_corpus_is_left_out(corpus, tmp_path):
 def test_lag_planted_into_a_generated_corpus_is_found_within_a_frame(corpus, tmp_path, late):
     store = open_store(corpus)
     clips = [late_hands(store.clip(clip_id), late) for clip_id in store.ids]
-    write_clips(tmp_path / "clips", clips)
-    quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
-    offsets = tables(tmp_path / "quality")[0]["time_offset_frames"].dropna()
+    offsets = measured(tmp_path, clips)[0]["time_offset_frames"].dropna()
     assert len(offsets) >= 0.6 * len(clips)
     # Hands slip on the object, so that a short clip may have a higher correlation at another lag.
     assert (np.abs(offsets - late) <= 1).mean() >= 0.8
@@ -245,9 +219,7 @@ def test_measures_do_not_depend_on_how_the_world_is_turned(make_clip, tmp_path):
     """Quarter turn about z and a shift: x to y, y to -x."""
     clip = make_clip(FRAMES, seed=3)
     turned = in_another_world(clip, Rotation.from_rotvec([0, 0, np.pi / 2]), np.array([1.0, -2.0, 0.5]))
-    write_clips(tmp_path / "clips", [clip, replace(turned, clip_id="test/s1/turned")])
-    quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
-    rows, _ = tables(tmp_path / "quality")
+    rows, _ = measured(tmp_path, [clip, replace(turned, clip_id="test/s1/turned")])
     for measure in CLIP_MEASURES:
         first, second = rows[measure.name]
         assert first == pytest.approx(second, rel=0.02, abs=1e-4, nan_ok=True), measure.name

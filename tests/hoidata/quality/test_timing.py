@@ -55,13 +55,6 @@ def test_planted_lag_is_found_to_the_frame_where_the_object_does_not_turn(late, 
     assert offset.confidence == pytest.approx(1, abs=0.005)
 
 
-def test_a_hand_fixed_to_a_rotating_object_has_correlation_1():
-    scene = carried(turning=1.5)
-    offset = time_offset([(scene.joints, usable())], scene.motion)
-    assert offset.frames == 0
-    assert offset.confidence == pytest.approx(1, abs=1e-9)
-
-
 def test_confidence_is_the_normalised_correlation_of_velocities():
     scene = carried(60, turning=0.0)
     joints = scene.joints + np.random.default_rng(0).normal(0, 0.01, scene.joints.shape)
