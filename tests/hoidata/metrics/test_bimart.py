@@ -14,8 +14,7 @@ from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.metrics import bimart
 from hoidata.metrics.evaluate import evaluate_store
-from hoidata.metrics.optional_metrics import BIMART_METRICS, OPTIONAL_LISTS, select_metrics
-from hoidata.metrics.registry import METRICS
+from hoidata.metrics.optional_metrics import BIMART_METRICS, select_metrics
 from hoidata.metrics.target_contact import (
     DISTANCES_NAME,
     TargetDistances,
@@ -392,8 +391,3 @@ def test_optional_metrics_are_computed_only_on_request(write_annotated, moved, t
     write_target_distances(tmp_path / "two", {predicted[1].clip_id: short})
     reasons = {item["clip_id"]: item["reason"] for item in evaluate_store(tmp_path / "two" / "clips", root)["left_out"]}
     assert "5 frames, not 12" in reasons[predicted[1].clip_id]
-
-
-def test_names_and_titles_of_all_lists_are_different():
-    metrics = [*METRICS, *(metric for optional in OPTIONAL_LISTS.values() for metric in optional)]
-    assert len({metric.name for metric in metrics}) == len({metric.title for metric in metrics}) == len(metrics)
