@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.clips.clip import SIDES, Clip, Side
+from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
 from hoidata.conformance.check import Finding, check_adapter
 from hoidata.conformance.loading import first_difference, opened_files
 from hoidata.datasets import DatasetPart, RawTree, SequenceKey, get_adapter
@@ -20,7 +20,7 @@ from hoidata.datasets.arctic.adapter import ArcticAdapter
 from hoidata.datasets.grab.adapter import GrabAdapter
 from hoidata.datasets.h2o.adapter import H2OAdapter
 from hoidata.errors import BadInput
-from hoidata.hands import load_embedded_hands
+from hoidata.hands import HandModel, load_embedded_hands
 from tests.builders import kitchen
 
 HANDS = load_embedded_hands()
@@ -48,11 +48,7 @@ def not_passed(findings: list[Finding]) -> dict[str, str]:
 
 def changed(example: type, change: Callable[[Clip], Clip]) -> object:
     """The example adapter with ``change`` applied to every clip."""
-
-    def load(self, raw: RawTree, key: SequenceKey, hands) -> list:
-        return [change(item) for item in example.load(self, raw, key, hands)]
-
-    return mistaken(example, {"load": load})
+    return mistaken(example, loading(lambda clips, *_: list(map(change, clips)))(example))
 
 
 def mistaken(example: type, methods: dict) -> object:
@@ -140,30 +136,36 @@ def quaternions_from(order: list[int], sides: tuple[Side, ...] = ()) -> Callable
 WXYZ_AS_XYZW, XYZW_AS_WXYZ = [3, 0, 1, 2], [1, 2, 3, 0]
 
 
-def without_mean(clip: Clip) -> Clip:
-    hands = {s: replace(t, hand_pose=(t.hand_pose - HANDS[s].mean_pose).astype("f4")) for s, t in clip.hands.items()}
-    return replace(clip, hands=hands)
+def each_hand(change: Callable[[HandTrack, HandModel], dict[str, np.ndarray]]) -> Callable[[Clip], Clip]:
+    """A change of both hand tracks, from each track and its model."""
+
+    def changed_hands(clip: Clip) -> Clip:
+        hands = {side: replace(track, **change(track, HANDS[side])) for side, track in clip.hands.items()}
+        return replace(clip, hands=hands)
+
+    return changed_hands
 
 
-def mean_twice(clip: Clip) -> Clip:
-    hands = {s: replace(t, hand_pose=(t.hand_pose + HANDS[s].mean_pose).astype("f4")) for s, t in clip.hands.items()}
-    return replace(clip, hands=hands)
-
-
-def transl_for_wrist(clip: Clip) -> Clip:
-    hands = {
-        s: replace(t, wrist_m=(t.wrist_m - HANDS[s].wrist_offset_m(t.betas, t.template_m)).astype("f4"))
-        for s, t in clip.hands.items()
+without_mean = each_hand(lambda track, model: {"hand_pose": (track.hand_pose - model.mean_pose).astype("f4")})
+mean_twice = each_hand(lambda track, model: {"hand_pose": (track.hand_pose + model.mean_pose).astype("f4")})
+transl_for_wrist = each_hand(
+    lambda track, model: {
+        "wrist_m": (track.wrist_m - model.wrist_offset_m(track.betas, track.template_m)).astype("f4"),
     }
-    return replace(clip, hands=hands)
+)
+hands_in_millimetres = each_hand(lambda track, _: {"wrist_m": track.wrist_m * 1000})
+nine_betas = each_hand(lambda track, _: {"betas": track.betas[:, :9]})
+betas_without_frames = each_hand(lambda track, _: {"betas": track.betas[0]})
+without_hands = each_hand(lambda track, _: {"valid": np.zeros_like(track.valid)})
 
 
 def sides_exchanged(clip: Clip) -> Clip:
     return replace(clip, hands={"left": clip.hands["right"], "right": clip.hands["left"]})
 
 
-def hands_in_millimetres(clip: Clip) -> Clip:
-    return replace(clip, hands={s: replace(t, wrist_m=t.wrist_m * 1000) for s, t in clip.hands.items()})
+def parts_exchanged(clip: Clip) -> Clip:
+    model = replace(clip.object.model, part=(1 - clip.object.model.part).astype(np.uint8))
+    return replace(clip, object=replace(clip.object, model=model))
 
 
 def mesh_times(scale) -> Callable[[Clip], Clip]:
@@ -176,10 +178,6 @@ def mesh_times(scale) -> Callable[[Clip], Clip]:
 
 def every_frame_of_the_source(clip: Clip) -> Clip:
     return replace(clip, source_frames=np.arange(clip.n_frames, dtype=np.int32))
-
-
-def betas(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Clip], Clip]:
-    return lambda c: replace(c, hands={s: replace(t, betas=change(t.betas)) for s, t in c.hands.items()})
 
 
 COUNTER = count()
@@ -217,8 +215,8 @@ WRONG_CLIPS: dict[str, tuple[Callable[[Clip], Clip], str]] = {
     "id": (lambda c: replace(c, clip_id=f"kitchen/{next(COUNTER):04d}"), "does not begin with kitchen/"),
     "dataset": (lambda c: replace(c, dataset="cellar"), "its dataset is 'cellar'"),
     "fitted": (lambda c: replace(c, hands_from="keypoints"), "fit_error_m must be stated"),
-    "nine betas": (betas(lambda values: values[:, :9]), "betas: expected shape (1, 10), got (1, 9)"),
-    "betas without frames": (betas(lambda values: values[0]), "betas: expected shape (24, 10), got (10,)"),
+    "nine betas": (nine_betas, "betas: expected shape (1, 10), got (1, 9)"),
+    "betas without frames": (betas_without_frames, "betas: expected shape (24, 10), got (10,)"),
     "NaN": (lambda c: replace(c, object=replace(c.object, rotvec=c.object.rotvec * np.nan)), "finite floats"),
 }
 # One source frame early or late, as if clocks differ; three interpolated frames between recorded ones.
@@ -242,6 +240,7 @@ def test_a_mistake_in_clips_is_caught(mistake: str, example: type, kitchen_root:
         (GrabAdapter, "grab", sides_exchanged, "sides exchanged, or mirrored?"),
         (ArcticAdapter, "arctic", without_mean, "with the mean pose added"),
         (ArcticAdapter, "arctic", transposed, "with object rotations transposed"),
+        (ArcticAdapter, "arctic", parts_exchanged, "with the object's parts exchanged"),
         (ArcticAdapter, "arctic", quaternions_from(WXYZ_AS_XYZW), "if quaternions are wxyz, not xyzw"),
         (GrabAdapter, "grab", quaternions_from(WXYZ_AS_XYZW), "if quaternions are wxyz, not xyzw"),
         (H2OAdapter, "h2o", quaternions_from(XYZW_AS_WXYZ), "if quaternions are xyzw, not wxyz"),
@@ -254,17 +253,10 @@ def test_a_wrong_convention_shows_on_the_embedded_corpora(base, name, change, wo
     assert words in str(problems)
 
 
-@pytest.mark.slow
-def test_exchanged_parts_of_an_object_show_on_arctic(small_corpus) -> None:
-    def exchanged(clip: Clip) -> Clip:
-        model = replace(clip.object.model, part=(1 - clip.object.model.part).astype(np.uint8))
-        return replace(clip, object=replace(clip.object, model=model))
-
-    problems = not_passed(check(changed(ArcticAdapter, exchanged), small_corpus("arctic").raw, sequences=8))
-    assert "with the object's parts exchanged" in str(problems)
-
-
 # Mistakes in finding and reading files: each function returns methods for a subclass of the example.
+Methods = Callable[[type], dict]
+
+
 def unsorted_keys(example: type) -> dict:
     return {"sequences": lambda self, root: example.sequences(self, root)[::-1]}
 
@@ -277,35 +269,36 @@ def opening_files(example: type) -> dict:
     return {"sequences": sequences}
 
 
-def numbered_ids(example: type) -> dict:
-    def load(self, raw, key, hands) -> list:
-        number = self.sequences(raw.root).index(key)
-        return [replace(clip, clip_id=f"{clip.clip_id}/{number}") for clip in example.load(self, raw, key, hands)]
+def loading(change: Callable[..., list]) -> Methods:
+    """A ``load`` that returns ``change(clips, adapter, raw, key)``."""
 
-    return {"load": load}
+    def methods(example: type) -> dict:
+        def load(self, raw: RawTree, key: SequenceKey, hands) -> list:
+            return change(example.load(self, raw, key, hands), self, raw, key)
 
+        return {"load": load}
 
-def reading_without_raw(example: type) -> dict:
-    def load(self, raw, key, hands) -> list:
-        size = len((raw.root / "recordings" / "p02" / "lift_cup_1.json").read_bytes())
-        return [replace(clip, gravity_note=str(size)) for clip in example.load(self, raw, key, hands)]
-
-    return {"load": load}
+    return methods
 
 
-def counting(example: type) -> dict:
-    calls = count()
-    return {"load": lambda *arguments: [replace(c, verb="lift" + "s" * next(calls)) for c in example.load(*arguments)]}
+def with_note(note: Callable[[RawTree], object]) -> Methods:
+    """A ``load`` that stores a text about the raw folder in the clips."""
+    return loading(lambda clips, _, raw, *__: [replace(clip, gravity_note=str(note(raw))) for clip in clips])
 
 
-def storing_the_root(example: type) -> dict:
-    def load(self, raw, key, hands) -> list:
-        return [replace(clip, gravity_note=str(raw.root)) for clip in example.load(self, raw, key, hands)]
-
-    return {"load": load}
+def numbered_ids(clips: list[Clip], adapter, raw: RawTree, key: SequenceKey) -> list[Clip]:
+    return [replace(clip, clip_id=f"{clip.clip_id}/{adapter.sequences(raw.root).index(key)}") for clip in clips]
 
 
-def raising(make: Callable[[], Exception]) -> Callable[[type], dict]:
+def size_without_raw(raw: RawTree) -> int:
+    return len((raw.root / "recordings" / "p02" / "lift_cup_1.json").read_bytes())
+
+
+def counting(clips: list[Clip], *_) -> list[Clip]:
+    return [replace(clip, verb="lift" + "s" * next(COUNTER)) for clip in clips]
+
+
+def raising(make: Callable[[], Exception]) -> Methods:
     def methods(example: type) -> dict:
         def load(*arguments) -> list:
             try:
@@ -318,35 +311,35 @@ def raising(make: Callable[[], Exception]) -> Callable[[type], dict]:
     return methods
 
 
-def returning_text(example: type) -> dict:
-    return {"load": lambda *arguments: [*example.load(*arguments), "a clip"]}
-
-
-def returning_nothing(example: type) -> dict:
-    return {"load": lambda *arguments: []}
-
-
 @pytest.mark.parametrize(
     ("methods", "rule", "words"),
     [
         (unsorted_keys, "sequences are sorted, unique and named as they should be", "not sorted"),
         (opening_files, "sequences are found by name: no file is opened", "recordings/p01/lift_cup_1.json is opened"),
-        (numbered_ids, "clips stay the same when another sequence is removed", "differs in"),
+        (loading(numbered_ids), "clips stay the same when another sequence is removed", "differs in"),
         (
-            reading_without_raw,
+            with_note(size_without_raw),
             "files are read through the RawTree only",
             "recordings/p02/lift_cup_1.json is opened without it",
         ),
-        (counting, "a second run gives the same", "differs in kitchen/p01/lift_cup_1.verb"),
-        (storing_the_root, "a copy of the named source files in another folder gives the same", "gravity_note"),
+        (loading(counting), "a second run gives the same", "differs in kitchen/p01/lift_cup_1.verb"),
+        (
+            with_note(lambda raw: raw.root),
+            "a copy of the named source files in another folder gives the same",
+            "gravity_note",
+        ),
         (raising(lambda: KeyError("trans")), "a damaged file raises BadInput, or gives valid clips", "KeyError"),
         (
             raising(lambda: BadInput("a recording", "a good one", "a bad one", "")),
             "errors name the file, the expected and the actual content and a remedy",
             "a recording",
         ),
-        (returning_text, "results are clips or quarantined intervals", "kitchen/p01/lift_cup_1: a str"),
-        (returning_nothing, "at least one sequence gives a clip", "it gives no clip"),
+        (
+            loading(lambda clips, *_: [*clips, "a clip"]),
+            "results are clips or quarantined intervals",
+            "kitchen/p01/lift_cup_1: a str",
+        ),
+        (loading(lambda *_: []), "at least one sequence gives a clip", "it gives no clip"),
     ],
 )
 def test_a_mistake_in_finding_or_reading_files_is_caught(methods, rule, words, example, kitchen_root) -> None:
@@ -414,10 +407,6 @@ def test_one_clip_of_fifteen_frames_gets_no_verdict_on_its_convention(example: t
         "not decided: 15 frames with a hand; 40 are needed, at most 24 of each clip count: load more sequences"
     )
     assert "transposed by 0.0" in str(not_passed(check(changed(example, transposed), kitchen_root, sequences=2)))
-
-
-def without_hands(clip: Clip) -> Clip:
-    return replace(clip, hands={s: replace(t, valid=np.zeros_like(t.valid)) for s, t in clip.hands.items()})
 
 
 def flat_mesh(clip: Clip) -> Clip:
