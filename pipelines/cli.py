@@ -29,7 +29,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.add_typer(synth.app, name="synth", help="Write the generated corpora, or check their physics.")
+app.add_typer(synth.app, name="synth", help="Write the generated corpora.")
 app.add_typer(adapters.app, name="adapters", help="List the dataset adapters, or check one.")
 app.add_typer(raw.app, name="raw", help="Scan your raw files into a manifest, or verify them.")
 app.add_typer(lineage.app, name="lineage")

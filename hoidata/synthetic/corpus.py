@@ -22,7 +22,6 @@ from hoidata.workers import map_in_workers
 
 # "full" and "small" are the embedded corpora; "study" and "study-small" are the corpus ``study``.
 AnySize = Size | StudySize
-SIZES = ("full", "small", "study", "study-small")
 
 # By dataset: the writer of shared files, and the writer of one raw sequence.
 _WRITERS = {
@@ -44,7 +43,7 @@ def write_corpus(
         raise HoidataError(f"no corpus {size} named {dataset!r}; there are {', '.join(datasets_of(size))}")
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns) as progress, atomic_folder(root) as partial_root:
-        sequences = make_corpus(dataset, seed, size, jobs, progress)
+        sequences = _make_corpus(dataset, seed, size, jobs, progress)
         write_shared_files(dataset, partial_root, sequences, size)
         groups = by_raw_sequence(sequences)
         writing = map_in_workers(partial(write_raw_sequence, dataset, partial_root), groups, jobs)
@@ -52,17 +51,11 @@ def write_corpus(
     return sequences
 
 
-def make_corpus(
-    dataset: str, seed: int, size: AnySize, jobs: int, progress: Progress | None = None
-) -> list[TruthSequence]:
-    """Generate all actions of a corpus in plan order. The result does not depend on ``jobs``.
-
-    Raises HoidataError if no plausible sequence was found for an action.
-    """
+def _make_corpus(dataset: str, seed: int, size: AnySize, jobs: int, progress: Progress) -> list[TruthSequence]:
+    """Generate all actions of a corpus in plan order."""
 
     def run(function: Callable, tasks: Sequence, step: str) -> Iterable[tuple]:
-        results = map_in_workers(function, tasks, jobs)
-        return results if progress is None else progress.track(results, len(tasks), description=f"{dataset}: {step}")
+        return progress.track(map_in_workers(function, tasks, jobs), len(tasks), description=f"{dataset}: {step}")
 
     if size in ("full", "small"):
         generated = run(make_action, tasks_of(dataset, seed, size), "making")

@@ -11,7 +11,7 @@ from hoidata.synthetic.actions import ACTIONS, DATASET_IDS, Entry, Size, plan, s
 from hoidata.synthetic.catalogue import object_model, object_spec
 from hoidata.synthetic.grasps import GRASPS_PER_PAIR, Grip, Scene, search_pool
 from hoidata.synthetic.sequences import Person, make_person, make_sequence, sample_length
-from hoidata.synthetic.soundness import measure
+from hoidata.synthetic.soundness import is_sound
 from hoidata.synthetic.truth import TruthSequence
 
 _ATTEMPTS = 18
@@ -77,7 +77,7 @@ def _sound_sequence(
         grip = order[attempt % len(order)]
         play = 1 - attempt / (_ATTEMPTS - 1)
         truth = make_sequence(dataset, action, spec, model, grip, person, key, length, pair, play, rng)
-        if measure(truth, pair).is_sound:
+        if is_sound(truth, pair):
             return truth
     action_words = f"{action.verb} {action.object_name} by {entry.subject}"
     raise HoidataError(f"{dataset}: {action_words} is not plausible after {_ATTEMPTS} attempts")

@@ -1,7 +1,5 @@
 """Checks that a synthetic action is physically plausible, with the meshes of hands and object."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -13,7 +11,6 @@ from hoidata.objects.distance import SignedDistance
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.contact_forces import (
     RESIDUAL_LIMIT,
-    Contacts,
     body_motion,
     force_residual,
     hand_patches,
@@ -32,61 +29,37 @@ _IDLE_M = 0.2
 _NEAR_IDLE_M, _TABLE_M, _HANDS_APART_M = 0.028, 0.0, 0.012
 
 
-@dataclass(frozen=True)
-class Soundness:
-    """Measures of one action at 30 fps. "Grasp frames" are the lifted frames, or each hand's ``contact_by_side``."""
+def is_sound(truth: TruthSequence, pair: HandPair) -> bool:
+    """Whether contact forces explain the motion of the lifted object, and hands touch it without deep penetration.
 
-    residual: np.ndarray  # (lifted frame,) unexplained wrench, N and N m
-    distance_m: np.ndarray  # (grasp frame,) distance of the farther active hand, 0 inside the object
-    penetration_m: np.ndarray  # (frame,) depth, in all frames
-    joint_m: np.ndarray  # (grasp frame,) distance of the closest joint of the farther hand
-    idle_m: float  # smallest distance of an idle hand's joints to the object's vertices
-    least_idle_m: float  # minimum of ``idle_m``
-    clear: bool  # whether hands keep clear of the table and of each other
-
-    @property
-    def is_sound(self) -> bool:
-        return bool(
-            len(self.distance_m)
-            and (self.residual < RESIDUAL_LIMIT).all()
-            and (self.distance_m < LARGEST_DISTANCE_M).all()
-            and (self.penetration_m < LARGEST_PENETRATION_M).all()
-            and (self.joint_m < _JOINT_TOUCH_M).all()
-            and self.idle_m > self.least_idle_m
-            and self.clear
-        )
-
-
-def measure(truth: TruthSequence, pair: HandPair, hand_shift_m: np.ndarray | None = None) -> Soundness:
-    """Measure an action at 30 fps. hand_shift_m: (3,) translation of the active hands, for the negative control."""
+    Idle hands must be away. With ``contact_by_side``, hands must touch in all frames of their contact, else while the
+    object is lifted.
+    """
     truth = truth.at_30_fps()
-    lifted = np.flatnonzero(truth.lifted)
-    near, distances, joints = dict[Side, SignedDistance](), dict[Side, np.ndarray](), dict[Side, np.ndarray]()
-    for side in truth.active_sides:
-        near[side] = _distances(truth, side, pair, hand_shift_m)
-        distances[side] = near[side].distance_m.min(1)
-        joints[side] = _joint_distance(truth, side, pair, near[side], hand_shift_m)
-    penetration = np.max([-distance for distance in distances.values()], axis=0).clip(0)
+    grasping = {side: truth.in_contact(side) if truth.contact_by_side else truth.lifted for side in truth.active_sides}
+    near = surface_distances(truth, pair)
+    for side, distances in near.items():
+        distance_m, joint_m = distances.distance_m.min(1), _joint_distance(truth, side, pair, distances)
+        is_near = (distance_m < LARGEST_DISTANCE_M) & (joint_m < _JOINT_TOUCH_M)
+        if distance_m.min() <= -LARGEST_PENETRATION_M or not is_near[grasping[side]].all():
+            return False
+    if not np.any(list(grasping.values())):
+        return False
     if truth.contact_by_side:
-        distance, joint = _during_contact(truth, distances), _during_contact(truth, joints)
-        idle_m, least_idle_m, clear = _near_idle(truth, pair), _NEAR_IDLE_M, _is_clear(truth, pair)
+        is_clear = _near_idle(truth, pair) > _NEAR_IDLE_M and _is_clear(truth, pair)
     else:
-        distance, joint = (np.max([d[lifted] for d in by_side.values()], axis=0) for by_side in (distances, joints))
-        idle_m, least_idle_m, clear = _idle(truth, pair), _IDLE_M, True
-    return Soundness(
-        residual=_residuals(truth, near, pair, lifted),
-        distance_m=np.maximum(distance, 0),
-        penetration_m=penetration,
-        joint_m=joint,
-        idle_m=idle_m,
-        least_idle_m=least_idle_m,
-        clear=clear,
-    )
+        is_clear = _idle(truth, pair) > _IDLE_M
+    return is_clear and bool((force_residuals(truth, near, pair) < RESIDUAL_LIMIT).all())
 
 
-def _during_contact(truth: TruthSequence, values: dict[Side, np.ndarray]) -> np.ndarray:
-    """Concatenate the values (frame,) of each hand during its contact."""
-    return np.concatenate([values[side][truth.in_contact(side)] for side in truth.contact_by_side])
+def surface_distances(truth: TruthSequence, pair: HandPair) -> dict[Side, SignedDistance]:
+    """Return the signed distances (frame, 778) of the vertices of each active hand to the object's surface."""
+    distances: dict[Side, SignedDistance] = {}
+    for side in truth.active_sides:
+        vertices = track_vertices(truth.hands[side], pair[side]).astype(np.float64)
+        points = truth.object.world_from_object.inverse() @ vertices
+        distances[side] = surface_index(truth.object.model).nearest(points, truth.object.hinge_rad, REACH_M)
+    return distances
 
 
 def _near_idle(truth: TruthSequence, pair: HandPair) -> float:
@@ -112,56 +85,28 @@ def _is_clear(truth: TruthSequence, pair: HandPair) -> bool:
     return bool(between > _HANDS_APART_M and lowest > _TABLE_M)
 
 
-def residuals_without_contact(truth: TruthSequence) -> np.ndarray:
-    """Return (lifted frame,) residuals without any contact, for the negative control."""
-    truth = truth.at_30_fps()
-    return np.linalg.norm(_wrench(truth)[0][truth.lifted], axis=1)
-
-
-def _wrench(truth: TruthSequence):
+def force_residuals(truth: TruthSequence, near: dict[Side, SignedDistance], pair: HandPair) -> np.ndarray:
+    """Return (lifted frame,) the part of the object's wrench that no contact forces explain, N and N m, at 30 fps."""
     track = truth.object
     motion = body_motion(track.model, rotvec_to_rotmat(track.rotvec), track.translation_m, track.hinge_rad)
-    return required_wrench(motion, FPS, GRAVITY), motion
-
-
-def _residuals(
-    truth: TruthSequence, near: dict[Side, SignedDistance], pair: HandPair, lifted: np.ndarray
-) -> np.ndarray:
-    wrench, motion = _wrench(truth)
-    patches = {side: hand_patches(pair[side]) for side in near}
-    residual = np.empty(len(lifted))
-    for index, frame in enumerate(lifted):
+    wrench = required_wrench(motion, FPS, GRAVITY)
+    patches, residuals = {side: hand_patches(pair[side]) for side in near}, []
+    for frame in np.flatnonzero(truth.lifted):
         contacts = [patch_contacts(one, patches[side], frame) for side, one in near.items()]
-        points, normals = _in_world(truth, frame, contacts)
-        residual[index] = force_residual(points, normals, motion.centre_m[frame], wrench[frame])
-    return residual
+        world_from_object = track.world_from_object[frame]
+        points = world_from_object @ np.concatenate([contact.points_m for contact in contacts])
+        normals = world_from_object.turn(np.concatenate([contact.normals for contact in contacts]))
+        residuals.append(force_residual(points, normals, motion.centre_m[frame], wrench[frame]))
+    return np.array(residuals)
 
 
-def _in_world(truth: TruthSequence, frame: int, contacts: list[Contacts]) -> tuple[np.ndarray, np.ndarray]:
-    world_from_object = truth.object.world_from_object[frame]
-    points = np.concatenate([contact.points_m for contact in contacts])
-    normals = np.concatenate([contact.normals for contact in contacts])
-    return world_from_object @ points, world_from_object.turn(normals)
-
-
-def _object_points(truth: TruthSequence, points_m: np.ndarray, shift_m: np.ndarray | None) -> np.ndarray:
-    moved = points_m.astype(np.float64) + (0.0 if shift_m is None else shift_m)
-    return truth.object.world_from_object.inverse() @ moved
-
-
-def _distances(truth: TruthSequence, side: Side, pair: HandPair, shift_m: np.ndarray | None) -> SignedDistance:
-    """Return signed distances of the hand's vertices."""
-    points = _object_points(truth, track_vertices(truth.hands[side], pair[side]), shift_m)
-    return surface_index(truth.object.model).nearest(points, truth.object.hinge_rad, REACH_M)
-
-
-def _joint_distance(truth, side: Side, pair: HandPair, vertices: SignedDistance, shift_m) -> np.ndarray:
+def _joint_distance(truth: TruthSequence, side: Side, pair: HandPair, vertices: SignedDistance) -> np.ndarray:
     """Return (frame,) distance of the closest fingertip vertex, or of the closest joint if no tip touches."""
     tips = np.abs(vertices.distance_m[:, list(TIP_VERTICES)]).min(1)
     far = np.flatnonzero(tips > _JOINT_TOUCH_M)
     if len(far):
-        track = truth.hands[side]
-        joints = _object_points(truth, track_joints(track, pair[side]), shift_m)[far]
+        joints = track_joints(truth.hands[side], pair[side]).astype(np.float64)
+        joints = (truth.object.world_from_object.inverse() @ joints)[far]
         hinge = None if truth.object.hinge_rad is None else truth.object.hinge_rad[far]
         tips[far] = surface_index(truth.object.model).distance_m(joints, hinge).min(1)
     return tips
@@ -174,11 +119,6 @@ def _idle(truth: TruthSequence, pair: HandPair) -> float:
     middle = (base.min(0) + base.max(0)) / 2
     radius = np.linalg.norm(base - middle, axis=1).max()
     centre = track.world_from_object @ middle[None]
-    nearest = np.inf
-    for side in SIDES:
-        hand = truth.hands[side]
-        if side in truth.active_sides or not hand.valid.any():
-            continue
-        gap = np.linalg.norm(track_joints(hand, pair[side]) - centre, axis=2).min() - radius
-        nearest = min(nearest, float(gap))
-    return nearest
+    idle = [side for side in SIDES if side not in truth.active_sides and truth.hands[side].valid.any()]
+    joints = [track_joints(truth.hands[side], pair[side]) for side in idle]
+    return min((np.linalg.norm(positions - centre, axis=2).min() - radius for positions in joints), default=np.inf)

@@ -32,7 +32,7 @@ from hoidata.synthetic.sequences import (
     released_frames,
     sample_release,
 )
-from hoidata.synthetic.soundness import measure, vertex_distances_m
+from hoidata.synthetic.soundness import is_sound, vertex_distances_m
 from hoidata.synthetic.study_plan import (
     ANGLES,
     HANDOVER,
@@ -165,7 +165,7 @@ def _sound_clip(task: ClipTask, entry: StudyEntry, pair: HandPair) -> TruthSeque
             grips = grasps[(first + attempt) % len(grasps)]
             scenario = Scenario(dataset, study_object, entry.verb, regions[0], grips, person, source_key=key, left=left)
             truth = make_study_sequence(scenario, contact_frames, pair, _PLAYS[attempt // len(grasps)], rng)
-            if measure(truth, pair).is_sound:
+            if is_sound(truth, pair):
                 return truth
     action_words = f"{entry.verb} {study_object.spec.name} by {entry.subject} with {entry.hand}"
     raise HoidataError(f"{dataset}: {action_words}: no plausible clip")

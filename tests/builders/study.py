@@ -1,11 +1,14 @@
 """A few clips of the corpus ``study``, generated in seconds: one object, no rejection sampling."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from hoidata.clips import SIDES, Clip
 from hoidata.hands import load_embedded_hands
+from hoidata.physics.contact_forces import RESIDUAL_LIMIT
+from hoidata.synthetic.soundness import force_residuals, is_sound, surface_distances
 from hoidata.synthetic.study import (
     PoolTask,
     Scenario,
@@ -15,6 +18,7 @@ from hoidata.synthetic.study import (
     sample_contact_frames,
 )
 from hoidata.synthetic.study_plan import STUDY_OBJECTS
+from hoidata.synthetic.truth import TruthSequence
 from tests.builders.clips import clip_of
 
 # Clips of each verb and hand by each subject of the small corpora: training, validation, test.
@@ -60,3 +64,28 @@ def study_clips(dataset: str, object_index: int, verbs: Sequence[str]) -> list[C
                 facts = {"verb": verb, "object_words": study_object.spec.words}
                 clips.append(clip_of(name, clip.object, {side: clip.hands[side] for side in SIDES}, **facts))
     return clips
+
+
+def shifted(truth: TruthSequence, shift_m: np.ndarray) -> TruthSequence:
+    return replace(
+        truth, hands={side: replace(hand, wrist_m=hand.wrist_m + shift_m) for side, hand in truth.hands.items()}
+    )
+
+
+def check_soundness(truths: Sequence[TruthSequence]) -> None:
+    """Contact forces explain the motion of lifted objects; they do not after the hands are shifted, or far away."""
+    pair, explained = load_embedded_hands(), []
+    directions = np.random.default_rng(7).normal(size=(len(truths), 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    for truth, direction in zip(truths, directions, strict=True):
+        assert is_sound(truth, pair)
+        assert not is_sound(shifted(truth, np.array([0.0, 0.0, 0.2])), pair)
+        for distance_m in (0.0, 0.01, 0.3):
+            moved = shifted(truth, distance_m * direction).at_30_fps()
+            residuals = force_residuals(moved, surface_distances(moved, pair), pair)
+            explained.append((len(residuals), (residuals < RESIDUAL_LIMIT).sum()))
+    n_frames, n_explained = np.array(explained).reshape(len(truths), 3, 2).sum(axis=0).T
+    assert n_frames[0] > 100
+    assert n_explained[0] == n_frames[0]
+    assert n_explained[1] < 0.8 * n_frames[0]
+    assert n_explained[2] <= 0.02 * n_frames[0]
