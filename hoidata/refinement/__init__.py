@@ -2,12 +2,11 @@
 
 from hoidata.refinement.contact import carried_fraction, refine_grasps
 from hoidata.refinement.fitting import GeneratedKeypoints, fit_hands
-from hoidata.refinement.refining import RefinementSettings, refine_hands
+from hoidata.refinement.refining import refine_hands
 from hoidata.refinement.released import refine_as_released
 
 __all__ = [
     "GeneratedKeypoints",
-    "RefinementSettings",
     "carried_fraction",
     "fit_hands",
     "refine_as_released",

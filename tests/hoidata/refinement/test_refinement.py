@@ -12,7 +12,7 @@ from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
-from hoidata.refinement import GeneratedKeypoints, RefinementSettings, fit_hands, refine_hands
+from hoidata.refinement import GeneratedKeypoints, fit_hands, refine_hands
 from hoidata.refinement.banded import solve_damped
 from hoidata.refinement.fitting import MAX_SHAPE_NORM
 from hoidata.refinement.skin import HandPose
@@ -55,9 +55,8 @@ def scene() -> dict[str, dict]:
     return {"generated": generated, "fitted": fitted, "refined": refined(generated, fitted)}
 
 
-def refined(generated: dict, fitted: dict, model: ObjectModel = BOX, **settings) -> dict[Side, HandTrack]:
-    object_track = still_object(model, len(generated["left"].is_active))
-    return refine_hands(PAIR, IDS, generated, fitted, object_track, RefinementSettings(**settings))
+def refined(generated: dict, fitted: dict, model: ObjectModel = BOX) -> dict[Side, HandTrack]:
+    return refine_hands(PAIR, IDS, generated, fitted, still_object(model, len(generated["left"].is_active)))
 
 
 def depth_mm(tracks: dict[Side, HandTrack], model: ObjectModel = BOX) -> np.ndarray:
@@ -143,9 +142,10 @@ def test_refinement_uses_one_blas_thread(scene, monkeypatch):
         return solve_damped(*arguments)
 
     threads: list[int] = []
+    monkeypatch.setattr("hoidata.refinement.refining.STEPS", 1)
     monkeypatch.setattr("hoidata.refinement.banded.solve_damped", watched)
     with threadpool_limits(2, user_api="blas"):
-        refined(scene["generated"], scene["fitted"], steps=1)
+        refined(scene["generated"], scene["fitted"])
     assert set(threads) == {1}
 
 
