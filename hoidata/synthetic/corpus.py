@@ -45,8 +45,10 @@ def write_corpus(
     with Progress(*columns) as progress, atomic_folder(root) as partial_root:
         sequences = _make_corpus(dataset, seed, size, jobs, progress)
         write_shared_files(dataset, partial_root, sequences, size)
-        groups = by_raw_sequence(sequences)
-        writing = map_in_workers(partial(write_raw_sequence, dataset, partial_root), groups, jobs)
+        groups: dict[str, list[TruthSequence]] = {}
+        for truth in sequences:
+            groups.setdefault(truth.source_key, []).append(truth)
+        writing = map_in_workers(partial(write_raw_sequence, dataset, partial_root), list(groups.values()), jobs)
         list(progress.track(writing, len(groups), description=f"{dataset}: writing"))
     return sequences
 
@@ -82,11 +84,3 @@ def write_shared_files(dataset: str, root: Path, sequences: list[TruthSequence],
 def write_raw_sequence(dataset: str, root: Path, members: list[TruthSequence]) -> None:
     """Write the files of one raw sequence with the actions ``members`` in their order."""
     _WRITERS[dataset][1](root, members, load_embedded_hands())
-
-
-def by_raw_sequence(sequences: list[TruthSequence]) -> list[list[TruthSequence]]:
-    """Group the actions by raw sequence, in time order."""
-    groups: dict[str, list[TruthSequence]] = {}
-    for truth in sequences:
-        groups.setdefault(truth.source_key, []).append(truth)
-    return [sorted(members, key=lambda truth: truth.raw_start) for members in groups.values()]

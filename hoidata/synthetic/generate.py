@@ -49,12 +49,12 @@ def make_action(task: _Task) -> list[tuple[int, TruthSequence]]:
     return [(position, _sound_sequence(task, entry, *drawn[entry.subject], pair)) for position, entry in task.entries]
 
 
-def _number(subject: str) -> int:
+def subject_number(subject: str) -> int:
     return int("".join(filter(str.isdigit, subject)))
 
 
 def _person(task: _Task, subject: str, pair: HandPair) -> Person:
-    rng = np.random.default_rng([task.seed, DATASET_IDS[task.dataset], _PERSON_STREAM, _number(subject)])
+    rng = np.random.default_rng([task.seed, DATASET_IDS[task.dataset], _PERSON_STREAM, subject_number(subject)])
     return make_person(task.dataset, subject, pair, rng)
 
 
@@ -67,7 +67,9 @@ def _sound_sequence(
     """
     dataset, action = task.dataset, ACTIONS[task.dataset][task.action]
     spec, model = object_spec(dataset, action.object_name), object_model(dataset, action.object_name)
-    rng = np.random.default_rng([task.seed, DATASET_IDS[dataset], entry.action, _number(entry.subject), entry.number])
+    rng = np.random.default_rng(
+        [task.seed, DATASET_IDS[dataset], entry.action, subject_number(entry.subject), entry.number]
+    )
     length = sample_length(dataset, action.verb, rng)
     grab_key = f"{entry.subject}/{action.object_name}_{action.intent}_{entry.number}"
     key = grab_key if dataset == "grab" else entry.subject

@@ -33,8 +33,8 @@ from hoidata.synthetic.hand_capsules import (
     gradient,
     grid_field,
     hand_pose_rotvec,
-    mirrored,
     sample_placements,
+    seen_by,
 )
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
@@ -161,14 +161,10 @@ def _in_part(field: Field, upright_from_part: np.ndarray, points_m: np.ndarray) 
     return field(points_m @ upright_from_part)
 
 
-def _mirrored(side: Side, field: Field) -> Field:
-    return mirrored(field) if side == "left" else field
-
-
 def sample_candidates(scene: Scene, side: Side, approach: Approach, count: int, rng: np.random.Generator) -> Placement:
     """Sample placements of one hand whose forearm comes from a person at -y."""
     sign = MIRROR if side == "left" else np.ones(3)
-    field = _mirrored(side, scene.part_fields[approach.part or 0] if approach.part is not None else scene.field)
+    field = seen_by(side, scene.part_fields[approach.part or 0] if approach.part is not None else scene.field)
     vertices = scene.part_vertices[approach.part] if approach.part is not None else np.concatenate(scene.part_vertices)
     low, high = vertices.min(0), vertices.max(0)
     centre = (low + high) / 2 if approach.through_m is None else np.asarray(approach.through_m)
@@ -185,7 +181,7 @@ def sample_candidates(scene: Scene, side: Side, approach: Approach, count: int, 
 def close_candidates(scene: Scene, side: Side, placement: Placement, hands: CapsuleHands) -> Candidates:
     """Close the fingers of each placement with its hand shape."""
     rows = hands.take(placement.hand)
-    return Candidates(side, placement, rows, *close_fingers(_mirrored(side, scene.field), rows, placement))
+    return Candidates(side, placement, rows, *close_fingers(seen_by(side, scene.field), rows, placement))
 
 
 def clear_of_table(scene: Scene, candidates: Candidates) -> np.ndarray:
@@ -203,7 +199,7 @@ def clear_of_table(scene: Scene, candidates: Candidates) -> np.ndarray:
 
 def capsule_contacts(scene: Scene, candidates: Candidates) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return, by candidate, contact points and outward normals (contact, 3), upright world; one per capsule."""
-    field = _mirrored(candidates.side, scene.field)
+    field = seen_by(candidates.side, scene.field)
     points = candidates.points(candidates.flexion_rad)
     distance = field(points)
     nearest = distance.argmin(-1)
@@ -280,8 +276,13 @@ def posed_hands(candidates: Candidates, betas: np.ndarray) -> PosedHands:
     wrist_m = candidates.wrist_m
     if candidates.side == "left":
         wrist_m, rotmats = wrist_m * MIRROR, np.diag(MIRROR) @ rotmats @ np.diag(MIRROR)
-        pose, opened = (mirror_rotvec_x(one.reshape(-1, 15, 3)).reshape(-1, 45) for one in (pose, opened))
+        pose, opened = mirrored_pose(pose), mirrored_pose(opened)
     return PosedHands(candidates.side, wrist_m, rotmats, pose, open_pose=opened, betas=betas[rows])
+
+
+def mirrored_pose(hand_pose: np.ndarray) -> np.ndarray:
+    """Mirror finger axis-angles (..., 45) to the other hand."""
+    return mirror_rotvec_x(hand_pose.reshape(-1, 15, 3)).reshape(hand_pose.shape)
 
 
 def verify(scene: Scene, grasp: GraspSpec, hands: list[PosedHands], pair: HandPair) -> np.ndarray:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hoidata.geometry.rotations import rotmat_to_rotvec
-from hoidata.hands.model import TIP_VERTICES, HandModel
+from hoidata.hands.model import TIP_VERTICES, HandModel, Side
 from hoidata.objects.distance_grid import interpolated
 from hoidata.objects.surface_index import PartSurface
 
@@ -167,9 +167,9 @@ _GRADIENT_STEP_M = 1e-3
 Field = Callable[[np.ndarray], np.ndarray]
 
 
-def mirrored(field: Field) -> Field:
-    """Mirror a field in x, so that left hands can be searched as right hands."""
-    return lambda points_m: field(points_m * np.array([-1.0, 1.0, 1.0]))
+def seen_by(side: Side, field: Field) -> Field:
+    """Mirror a field in x for a left hand, so that it can be searched as a right hand."""
+    return field if side == "right" else lambda points_m: field(points_m * np.array([-1.0, 1.0, 1.0]))
 
 
 def gradient(field: Field, points_m: np.ndarray) -> np.ndarray:

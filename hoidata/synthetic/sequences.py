@@ -18,7 +18,7 @@ from hoidata.objects.model import ObjectModel, articulate
 from hoidata.objects.surface_index import surface_index
 from hoidata.synthetic.actions import LENGTH_DEVIATION, LONGEST_CLIP, MEAN_LENGTH, SHORTEST_CLIP, Action
 from hoidata.synthetic.catalogue import ObjectSpec
-from hoidata.synthetic.grasps import Grip, PosedHands
+from hoidata.synthetic.grasps import Grip, PosedHands, mirrored_pose
 from hoidata.synthetic.paths import ObjectPath, follow_path, minimum_jerk, waves, with_sway
 from hoidata.synthetic.truth import TruthSequence
 
@@ -304,7 +304,7 @@ def idle_hand(side: Side, person: Person, n_frames: int, rng: np.random.Generato
     if side == "left":
         wrist = wrist * np.array([-1.0, 1.0, 1.0])
         orient = mirror_rotvec_x(orient)
-        pose = mirror_rotvec_x(pose.reshape(-1, 15, 3)).reshape(-1, 45)
+        pose = mirrored_pose(pose)
     return hand_track(person, side, wrist, orient, pose, present)
 
 

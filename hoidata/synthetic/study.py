@@ -12,7 +12,8 @@ from hoidata.geometry.rotations import mirror_rotvec_x, rotmat_to_rotvec, rotvec
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
 from hoidata.synthetic.actions import DATASET_IDS
 from hoidata.synthetic.catalogue import model_of
-from hoidata.synthetic.grasps import Grip, PosedHands, Scene, search_pool
+from hoidata.synthetic.generate import subject_number
+from hoidata.synthetic.grasps import MIRROR, Grip, PosedHands, Scene, mirrored_pose, search_pool
 from hoidata.synthetic.paths import ObjectPath, follow_path, minimum_jerk, with_sway
 from hoidata.synthetic.sequences import (
     LIFTED_ABOVE_M,
@@ -89,13 +90,9 @@ def people_of(dataset: str, seed: int, size: StudySize) -> dict[str, Person]:
     pair = load_embedded_hands()
     stream = [seed, DATASET_IDS[dataset], _PERSON_STREAM]
     return {
-        name: make_person(dataset, name, pair, np.random.default_rng([*stream, _number(name)]))
+        name: make_person(dataset, name, pair, np.random.default_rng([*stream, subject_number(name)]))
         for name in shares(dataset, size)
     }
-
-
-def _number(subject: str) -> int:
-    return int(subject[1:])
 
 
 def pool_tasks(dataset: str, seed: int, size: StudySize) -> list[PoolTask]:
@@ -148,7 +145,7 @@ def _sound_clip(task: ClipTask, entry: StudyEntry, pair: HandPair) -> TruthSeque
     """
     study_object, dataset = STUDY_OBJECTS[task.dataset][entry.object_index], task.dataset
     stream = [task.seed, DATASET_IDS[dataset], _STREAM, entry.object_index, _VERB_STREAMS.index(entry.verb)]
-    rng = np.random.default_rng([*stream, _number(entry.subject), entry.number])
+    rng = np.random.default_rng([*stream, subject_number(entry.subject), entry.number])
     person = task.people[entry.subject]
     region_choices = choices(study_object, entry.verb, entry.hand)
     contact_frames = sample_contact_frames(entry.verb, rng)
@@ -227,7 +224,6 @@ _REGRASPS = 0.9  # probability in a long action
 _ASIDE_DEG, _FAR_ASIDE_M = 12.0, 0.15  # rotation of an object that is moved aside, full from this distance
 # Handover: when the second hand has grasped and when the first releases, as fractions of the contact.
 _RECEIVED, _RELEASED = 0.42, 0.58
-MIRROR = np.array([-1.0, 1.0, 1.0])
 # Distances of an idle hand from the object and from the other hand, and probabilities that it rests or passes close.
 _RESTING_M, _PASSING_M = (0.035, 0.08), (0.035, 0.055)
 _RESTS, _PASSES = 0.45, 0.15
@@ -394,10 +390,8 @@ def mirrored(truth: TruthSequence, person: Person, symmetry: np.ndarray) -> Trut
     other: dict[Side, Side] = {"left": "right", "right": "left"}
     hands: dict[Side, HandTrack] = {}
     for side, hand in truth.hands.items():
-        pose = mirror_rotvec_x(hand.hand_pose.reshape(-1, 15, 3)).reshape(-1, 45)
-        hands[other[side]] = hand_track(
-            person, other[side], hand.wrist_m * MIRROR, mirror_rotvec_x(hand.global_orient), pose, True
-        )
+        wrist_m, orient = hand.wrist_m * MIRROR, mirror_rotvec_x(hand.global_orient)
+        hands[other[side]] = hand_track(person, other[side], wrist_m, orient, mirrored_pose(hand.hand_pose), True)
     track = truth.object
     rotmats = np.diag(MIRROR) @ rotvec_to_rotmat(track.rotvec) @ symmetry.T
     hand_type = truth.hand_type if truth.hand_type == "both" else other[truth.hand_type]
@@ -413,7 +407,6 @@ def mirrored(truth: TruthSequence, person: Person, symmetry: np.ndarray) -> Trut
 
 def mirrored_grip(grip: Grip, symmetry: np.ndarray) -> Grip:
     """Convert a right hand's grip to the left hand's grip on the mirrored object."""
-    mirror = np.diag(MIRROR)
-    pose, opened = (mirror_rotvec_x(one.reshape(-1, 15, 3)).reshape(-1, 45) for one in (grip.hand_pose, grip.open_pose))
-    wrist_m, rotmat = symmetry @ grip.wrist_m, symmetry @ grip.rotmat @ mirror
+    wrist_m, rotmat = symmetry @ grip.wrist_m, symmetry @ grip.rotmat @ np.diag(MIRROR)
+    pose, opened = mirrored_pose(grip.hand_pose), mirrored_pose(grip.open_pose)
     return Grip("left", wrist_m, rotmat, hand_pose=pose, open_pose=opened, part=grip.part)

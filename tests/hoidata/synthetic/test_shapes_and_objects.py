@@ -8,7 +8,7 @@ from hoidata.objects.mesh import mass_properties
 from hoidata.objects.surface_index import PartSurface, surface_index
 from hoidata.splits.definitions import published
 from hoidata.synthetic.catalogue import OBJECTS, object_model, object_spec
-from hoidata.synthetic.hand_capsules import gradient, grid_field, mirrored
+from hoidata.synthetic.hand_capsules import gradient, grid_field, seen_by
 from hoidata.synthetic.shapes import cylinder, revolved, rounded_box, sharp_box, sphere, torus, united
 from tests.builders.objects import igl_signed_m
 
@@ -130,7 +130,7 @@ def test_a_mirrored_field_is_the_field_of_the_mirrored_object():
     model = object_model("grab", "mug")
     turned_round = grid_field(PartSurface(model.vertices_m * [-1, 1, 1], model.faces[:, ::-1], True, 0))
     points = np.random.default_rng(1).uniform(-0.08, 0.1, (600, 3))
-    actual, expected = mirrored(grid_field(surface_index(model).filled[0]))(points), turned_round(points)
+    actual, expected = seen_by("left", grid_field(surface_index(model).filled[0]))(points), turned_round(points)
     near = expected < 0.025
     assert near.sum() > 40
     assert np.abs(actual - expected)[near].max() < 0.003
