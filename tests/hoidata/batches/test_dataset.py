@@ -9,7 +9,6 @@ import torch
 from hoidata.batches.dataset import HoiDataset, collate
 from hoidata.batches.frame_selection import FrameSelection
 from hoidata.clips import SIDES, Clip, ObjectTrack
-from hoidata.clips.features import upright
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands, track_joints
@@ -125,17 +124,6 @@ def test_the_model_frame_is_upright_with_the_object_at_zero(clips: Clips) -> Non
     sample = HoiDataset(clips, "train")[0]
     np.testing.assert_allclose(sample.object[0, :3], 0, atol=1e-6)
     np.testing.assert_allclose(sample.world_from_model[:3, :3].T @ GRAVITY, [0, 0, -1], atol=1e-9)
-
-
-@pytest.mark.parametrize("gravity", [(0, 0, -1), (0, 0, 1), (0, -1, 0), (1, 2, -3), None])
-def test_upright_is_a_rotation_that_turns_gravity_down(gravity: tuple | None) -> None:
-    rotation = upright(None if gravity is None else np.array(gravity))
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(rotation) == pytest.approx(1)
-    if gravity is None or gravity == (0, 0, -1):
-        np.testing.assert_array_equal(rotation, np.eye(3))
-    else:
-        np.testing.assert_allclose(rotation @ gravity / np.linalg.norm(gravity), [0, 0, -1], atol=1e-12)
 
 
 def test_contact_and_distances_are_restricted_to_the_crop_and_to_acting_hands(clips: Clips) -> None:

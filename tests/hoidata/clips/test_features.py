@@ -1,4 +1,4 @@
-"""The feature layout, filled poses, slip and quarantine of clips, against independent formulas."""
+"""The feature layout, slip and recordings of clips, against independent formulas."""
 
 from dataclasses import replace
 
@@ -9,10 +9,8 @@ from scipy.spatial.transform import Rotation
 from hoidata.clips import SIDES
 from hoidata.clips.clip import FPS, ObjectTrack
 from hoidata.clips.features import hand_features, object_features, upright
-from hoidata.clips.quarantine import Quarantined
 from hoidata.clips.recording import HandRecording, SourceHandTrack
-from hoidata.clips.slip import MOVING_CM_S, joint_slips_cm_s
-from hoidata.errors import BadInput
+from hoidata.clips.slip import MOVING_CM_S, joint_slips_cm_s, touched_parts
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.kinematics import track_rotmats
 from hoidata.sensors.mano_hand import mano_hand
@@ -62,14 +60,6 @@ def test_upright_is_the_identity_where_gravity_is_unknown():
     np.testing.assert_array_equal(upright(None), np.eye(3))
 
 
-def test_invalid_poses_are_replaced_by_the_last_valid_one_and_stay_invalid():
-    track = build_clip().hands["right"]
-    valid = np.arange(30) % 3 == 1
-    filled = replace(track, valid=valid).with_last_valid_pose()
-    np.testing.assert_array_equal(filled.valid, valid)
-    np.testing.assert_array_equal(filled.wrist_m[:6], track.wrist_m[[1, 1, 1, 1, 4, 4]])
-
-
 def test_a_joint_slips_by_its_motion_over_a_part_that_moves_and_nowhere_else():
     """A box moves along x at 10 cm/s, then stands; a joint moves along y over it at 4 cm/s."""
     frames = np.arange(20)
@@ -84,11 +74,16 @@ def test_a_joint_slips_by_its_motion_over_a_part_that_moves_and_nowhere_else():
     assert len(joint_slips_cm_s(slow, joints, touched)) == 0
 
 
-def test_a_quarantined_sequence_keeps_every_part_of_its_error():
-    error = BadInput("a.npz", "a clip", "nothing", "download it again")
-    expected = ("grab/s1/a", "a.npz", "a clip", "nothing", "download it again")
-    left_out = Quarantined.from_error("grab/s1/a", error)
-    assert (left_out.source_key, left_out.where, left_out.expected, left_out.got, left_out.remedy) == expected
+def test_a_joint_touches_the_part_of_its_nearest_point_in_whatever_order_entries_come() -> None:
+    frame, joint = np.array([0, 0, 0, 1, 1, 2]), np.array([4, 4, 4, 4, 20, 4])
+    distance_m, part = np.array([0.010, 0.004, 0.012, 0.005, 0.001, 0.015]), np.array([1, 0, 1, 1, 0, 0])
+    for order in (np.arange(6), np.arange(6)[::-1], np.array([1, 3, 0, 5, 2, 4])):
+        touched = touched_parts(4, frame[order], joint[order], distance_m[order], part[order])
+        expected = np.full((4, 21), -1)
+        expected[0, 4], expected[1, 4], expected[1, 20], expected[2, 4] = 0, 1, 0, 0
+        np.testing.assert_array_equal(touched, expected)
+    nothing = np.zeros(0, int)
+    assert (touched_parts(3, nothing, nothing, np.zeros(0), nothing) == -1).all()
 
 
 def test_frames_of_a_recording_keep_hands_object_and_usable_together():

@@ -10,7 +10,6 @@ from hoidata.geometry.rotations import (
     rotmat_to_rot6d,
     rotmat_to_rotvec,
     rotvec_to_rotmat,
-    skew,
 )
 
 ANGLES = (0.0, 1e-9, 1e-7, 9e-7, 1.1e-6, 1e-4, 0.1, 1.0, 3.0, np.pi - 1e-6, np.pi)
@@ -33,11 +32,6 @@ def test_rotvec_to_rotmat_is_the_matrix_exponential(kind):
     got = rotvec_to_rotmat(kind(vectors))
     assert type(got) is type(kind(vectors))
     np.testing.assert_allclose(np.asarray(got), expected, atol=1e-13)
-
-
-def test_rotation_about_z_takes_x_towards_y():
-    quarter = rotvec_to_rotmat(np.array([0.0, 0.0, np.pi / 2]))
-    np.testing.assert_allclose(quarter @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-15)
 
 
 @pytest.mark.parametrize("kind", [np.asarray, torch.as_tensor])
@@ -98,12 +92,6 @@ def test_float32_stays_float32_and_accurate():
         got = np.asarray(rotvec_to_rotmat(kind(vectors)))
         assert got.dtype == np.float32
         np.testing.assert_allclose(got, expected, atol=5e-7)
-
-
-def test_skew_is_the_cross_product():
-    generator = torch.Generator().manual_seed(0)
-    first, second = torch.randn(2, 4, 3, generator=generator, dtype=torch.float64)
-    torch.testing.assert_close((skew(first) @ second[..., None])[..., 0], torch.linalg.cross(first, second))
 
 
 def test_no_rotations_give_no_rotations():

@@ -180,6 +180,7 @@ def test_command_hidden_in_a_whole_mano_file_is_refused_and_nothing_runs(release
         ("shapedirs", lambda model: text("lbs"), "shapedirs"),
         ("shapedirs", lambda model: instance("chumpy.ch", "Ch", {"y": integer(1)}), "shapedirs"),
         ("kintree_table", lambda model: array(np.zeros((2, 16), dtype=np.int64)), "parents"),
+        ("f", lambda model: array(model.faces + 1), "faces"),
     ],
 )
 def test_impossible_content_is_refused(released_folder, key, corrupted, field):

@@ -24,12 +24,11 @@ def mano_folder(tmp_path_factory):
     return folder
 
 
-def oracle(folder, side, flat, dtype, inputs):
+def oracle(folder, side, flat, dtype, inputs, **options):
     # smplx prints its 10 shape coefficients at each construction.
     with contextlib.redirect_stdout(io.StringIO()) as output:
-        layer = smplx.MANO(
-            str(folder), is_rhand=side == "right", use_pca=False, flat_hand_mean=flat, batch_size=BATCH, dtype=dtype
-        )
+        options |= {"use_pca": False, "flat_hand_mean": flat, "batch_size": BATCH, "dtype": dtype}
+        layer = smplx.MANO(str(folder), is_rhand=side == "right", **options)
     assert "10 shape coefficients" in output.getvalue()
     out = layer(**inputs)
     return out.vertices.detach(), out.joints.detach()
@@ -68,13 +67,7 @@ def test_layer_equals_smplx_on_a_personal_template(mano_folder):
     model = load_mano_hands(mano_folder).right
     personal = model.template_m * 1.07 + np.array([0.004, -0.01, 0.02])
     inputs = random_inputs(torch.float64) | {"betas": torch.zeros(BATCH, 10, dtype=torch.float64)}
-    with contextlib.redirect_stdout(io.StringIO()):
-        layer = smplx.MANO(
-            str(mano_folder), is_rhand=True, use_pca=False, flat_hand_mean=True, batch_size=BATCH,
-            dtype=torch.float64, v_template=torch.as_tensor(personal),
-        )  # fmt: skip
-    expected = layer(**inputs).vertices.detach()
-
+    expected, _ = oracle(mano_folder, "right", True, torch.float64, inputs, v_template=torch.as_tensor(personal))
     pose = torch.cat((inputs["global_orient"], inputs["hand_pose"]), 1)
     wrist_m = inputs["transl"] + torch.as_tensor(model.wrist_offset_m(np.zeros((1, 10)), personal))
     vertices, _ = HandKinematics(model, torch.float64)(

@@ -119,14 +119,6 @@ def test_an_idle_left_hand_is_the_mirror_image_of_a_right_one():
 
 
 @pytest.mark.parametrize("dataset", ONE_ACTION)
-def test_equal_seeds_give_equal_sequences_and_other_seeds_others(truths, dataset):
-    again = _one(dataset)
-    np.testing.assert_array_equal(again.object.translation_m, truths[dataset].object.translation_m)
-    side = again.active_sides[0]
-    np.testing.assert_array_equal(again.hands[side].hand_pose, truths[dataset].hands[side].hand_pose)
-
-
-@pytest.mark.parametrize("dataset", ONE_ACTION)
 def test_raw_files_read_frame_by_frame_as_the_field_reads_them_give_the_hands_and_the_object_that_were_made(
     truths, root, dataset
 ):
