@@ -6,7 +6,7 @@ object is pushed out (``grasp_solver``). ``carried_fraction`` tells whether hand
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from hoidata.hands.model import HandPair
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.capsules import CapsuleContacts, Capsules, joined
 from hoidata.physics.realism import StandardUnits
-from hoidata.physics.scene import Scene, capsules_or_nan, object_scene
+from hoidata.physics.scene import capsules_or_nan, object_scene
 from hoidata.refinement.grasp_solver import corrected_pose
 from hoidata.refinement.object_field import ObjectField, world_from_part
 from hoidata.refinement.skin import HandPose, SkinnedHand
@@ -121,61 +121,44 @@ def _grasps(
 def carried_fraction(pair: HandPair, clip: Clip) -> float:
     """Fraction of some frames with the object in the air in which the hands can carry it; 1 without such frames.
 
-    An object without known gravity or without an inside counts as carried.
+    Hands carry an object if friction at their contacts can produce its motion. An object without known gravity or
+    without an inside counts as carried.
     """
-    load, active = LiftedObject.of(clip), list[Side](side for side in SIDES if clip.hands[side].valid.any())
-    if not len(load.frames) or not active:
-        return float(not len(load.frames))
-    return load.carried_fraction([capsules_or_nan(clip.hands[side].take(load.frames), pair[side]) for side in active])
+    if clip.gravity is None or clip.n_frames < 3 or not surface_index(clip.object.model).is_solid:
+        return 1.0
+    scene = object_scene(clip)
+    in_air = np.flatnonzero(scene.lifted)
+    if not len(in_air):
+        return 1.0
+    frames = in_air[((np.arange(AIR_FRAMES) + 0.5) * len(in_air) / AIR_FRAMES).astype(int)]
+    tracks = {side: clip.hands[side].take(frames) for side in SIDES if clip.hands[side].valid.any()}
+    if not tracks:
+        return 0.0
+    capsules = joined([capsules_or_nan(track, pair[side]) for side, track in tracks.items()])
+    contacts, physics = field_contacts(ObjectField(clip.object), capsules, frames), StandardUnits()
+    return float((physics.residuals(scene, contacts)[frames] < physics.limit).mean())
 
 
-@dataclass(frozen=True)
-class LiftedObject:
-    """An object's motion, and some frames in which it is in the air; none if it never is."""
+def field_contacts(field: ObjectField, capsules: Capsules, frames: np.ndarray) -> CapsuleContacts:
+    """Contacts of capsules with an object in ``frames (frame,)``, at the deepest of some points along each axis.
 
-    scene: Scene | None
-    frames: np.ndarray
-    field: ObjectField
-
-    @classmethod
-    def of(cls, clip: Clip) -> "LiftedObject":
-        field = ObjectField(clip.object)
-        if clip.gravity is None or clip.n_frames < 3 or not surface_index(clip.object.model).is_solid:
-            return cls(None, np.zeros(0, int), field)
-        scene = object_scene(clip)
-        air = np.flatnonzero(scene.lifted)
-        evenly = ((np.arange(AIR_FRAMES) + 0.5) * len(air) / AIR_FRAMES).astype(int)
-        return cls(scene, air[evenly] if len(air) else air, field)
-
-    def carried_fraction(self, hands: Sequence[Capsules]) -> float:
-        """Fraction of the frames in which friction at the contacts of hands can produce the object's motion."""
-        if self.scene is None or not len(self.frames):
-            return 1.0
-        contacts, physics = self._contacts(joined(list(hands))), StandardUnits()
-        return float((physics.residuals(self.scene, contacts)[self.frames] < physics.limit).mean())
-
-    def _contacts(self, capsules: Capsules) -> CapsuleContacts:
-        """Contacts of capsules in ``frames``, at the deepest of some points along each axis.
-
-        Read from the distance grid; ``hoidata.physics.capsules.capsule_contacts`` is exact and far slower.
-        """
-        is_known = np.isfinite(capsules.start_m[..., 0])
-        capsules = Capsules(np.nan_to_num(capsules.start_m), np.nan_to_num(capsules.end_m), capsules.radius_m)
-        along = np.linspace(0, 1, _ALONG)[:, None]
-        axis = (capsules.end_m - capsules.start_m)[:, :, None]
-        positions_m = (capsules.start_m[:, :, None] + along * axis).reshape(len(self.frames), -1, 3)
-        nearest = self.field.distances(positions_m, self.frames)
-        shape = (*capsules.start_m.shape[:2], _ALONG)
-        distance, slope, position_m = (array.reshape(*shape, -1) for array in (*nearest, positions_m))
-        deepest = distance.argmin(axis=2, keepdims=True)
-        distance, slope, position_m = (
-            np.take_along_axis(a, deepest, 2)[:, :, 0] for a in (distance, slope, position_m)
-        )
-        # Interpolated gradients are shorter than one at edges, and zero in the middle of a thin object.
-        length = np.linalg.norm(slope, axis=-1)
-        slope /= np.maximum(length, _LEAST_SLOPE)[..., None]
-        frame, capsule = np.nonzero(is_known & (distance[..., 0] < capsules.radius_m) & (length > _LEAST_SLOPE))
-        depth, normal = (capsules.radius_m - distance[..., 0])[frame, capsule], slope[frame, capsule]
-        point = (position_m - distance * slope)[frame, capsule]
-        number = self.frames[frame]
-        return CapsuleContacts(number, capsule, np.zeros_like(number), depth, point, normal, point, normal)
+    Read from the distance grid; ``hoidata.physics.capsules.capsule_contacts`` is exact and far slower.
+    """
+    is_known = np.isfinite(capsules.start_m[..., 0])
+    capsules = Capsules(np.nan_to_num(capsules.start_m), np.nan_to_num(capsules.end_m), capsules.radius_m)
+    along = np.linspace(0, 1, _ALONG)[:, None]
+    axis = (capsules.end_m - capsules.start_m)[:, :, None]
+    positions_m = (capsules.start_m[:, :, None] + along * axis).reshape(len(frames), -1, 3)
+    nearest = field.distances(positions_m, frames)
+    shape = (*capsules.start_m.shape[:2], _ALONG)
+    distance, slope, position_m = (array.reshape(*shape, -1) for array in (*nearest, positions_m))
+    deepest = distance.argmin(axis=2, keepdims=True)
+    distance, slope, position_m = (np.take_along_axis(a, deepest, 2)[:, :, 0] for a in (distance, slope, position_m))
+    # Interpolated gradients are shorter than one at edges, and zero in the middle of a thin object.
+    length = np.linalg.norm(slope, axis=-1)
+    slope /= np.maximum(length, _LEAST_SLOPE)[..., None]
+    frame, capsule = np.nonzero(is_known & (distance[..., 0] < capsules.radius_m) & (length > _LEAST_SLOPE))
+    depth, normal = (capsules.radius_m - distance[..., 0])[frame, capsule], slope[frame, capsule]
+    point = (position_m - distance * slope)[frame, capsule]
+    number = frames[frame]
+    return CapsuleContacts(number, capsule, np.zeros_like(number), depth, point, normal, point, normal)

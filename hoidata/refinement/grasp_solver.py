@@ -116,7 +116,7 @@ class GraspObjective:
             nearest = grasped = self.field.distances(points, self.frames)
         else:
             to_part, to_passer = (
-                self.field.distances_to(part, points, self.frames) for part in (self.part, 1 - self.part)
+                self.field.distances(points, self.frames, part) for part in (self.part, 1 - self.part)
             )
             part_is_closer, passed = to_part[0] <= to_passer[0], self.passed[:, None]
             nearest = (

@@ -1,7 +1,5 @@
 """Signed distances to a moving object, from one distance grid per part at rest."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from hoidata.clips.clip import ObjectTrack
@@ -31,35 +29,26 @@ class ObjectField:
         """
         if len(self._parts) == 1:
             return 0, touching
-        nearest = np.argmin([self.distances_to(part, points_m)[0] for part in (0, 1)], axis=0)
+        nearest = np.argmin([self.distances(points_m, part=part)[0] for part in (0, 1)], axis=0)
         by_part = [touching & (nearest == number) for number in (0, 1)]
         part = int(by_part[1].sum() > by_part[0].sum())
         return part, by_part[part]
 
-    def distances(self, points_m: np.ndarray, frames: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Signed distance to the object, the smaller one of two parts.
+    def distances(
+        self, points_m: np.ndarray, frames: np.ndarray | None = None, part: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Signed distance to one part, or to the nearest part of the object.
 
         Args:
             points_m: (frame, point, 3) world.
             frames: (frame,) index of each frame in the object's motion, all frames by default.
+            part: index of the part; None for all.
 
         Returns distances (frame, point), metres, and their gradients (frame, point, 3), world.
         """
-        return self._lowest(self._parts, points_m, frames)
-
-    def distances_to(
-        self, part: int, points_m: np.ndarray, frames: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """As ``distances``, to one part."""
-        return self._lowest(self._parts[part : part + 1], points_m, frames)
-
-    @staticmethod
-    def _lowest(
-        parts: Sequence[_Part], points_m: np.ndarray, frames: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
         chosen = slice(None) if frames is None else frames
         distance, slope = np.full(points_m.shape[:2], np.inf), np.zeros(points_m.shape)
-        for grid, (rotation, offset) in parts:
+        for grid, (rotation, offset) in self._parts if part is None else [self._parts[part]]:
             lower_signed(*grid, rotation[chosen], offset[chosen], np.ascontiguousarray(points_m), distance, slope)
         return distance, slope
 

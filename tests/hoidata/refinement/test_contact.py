@@ -26,7 +26,7 @@ from hoidata.objects.surface_index import surface_index
 from hoidata.physics.realism import VARIANTS, score
 from hoidata.physics.scene import capsules_or_nan, clip_scene
 from hoidata.refinement import carried_fraction, refine_grasps
-from hoidata.refinement.contact import LiftedObject, _passed
+from hoidata.refinement.contact import _passed, field_contacts
 from hoidata.refinement.grasp_solver import spline_weights
 from hoidata.refinement.kernels import lower_capsules
 from hoidata.refinement.object_field import ObjectField
@@ -169,7 +169,7 @@ def test_a_hand_across_the_hinge_avoids_the_part_it_does_not_grasp(monkeypatch):
     def skin_near_base(track: HandTrack) -> float:
         skin = track_vertices(track, PAIR.right)[HELD].astype(np.float64)
         field, frames = ObjectField(clip.object), np.arange(FRAMES)[HELD]
-        return float((field.distances_to(0, skin, frames)[0] < 0.01).mean())
+        return float((field.distances(skin, frames, 0)[0] < 0.01).mean())
 
     avoiding = refine_grasps(PAIR, clip).hands["right"]
     monkeypatch.setattr("hoidata.refinement.contact._passed", lambda object_track, grasps: None)
@@ -253,13 +253,14 @@ def test_contact_normals_are_unit_vectors_and_the_centre_of_a_slab_has_no_contac
         hand = pressed("right", position_m + np.array([0, 0, thick_m / 2]), thick_m / 2 + 0.008, 0.0, rotation)
         object_track = ObjectTrack(slab, np.zeros_like(position_m), position_m)
         clip = clip_of("toy/s1/i", object_track, {"left": replace(hand, wrist_m=hand.wrist_m + 1), "right": hand})
-        load = LiftedObject.of(clip)
-        contacts = load._contacts(capsules_or_nan(hand.take(load.frames), PAIR["right"]))
+        assert np.isfinite(carried_fraction(PAIR, clip))
+        frames = np.array([18, 24, 30, 40])
+        capsules = capsules_or_nan(hand.take(frames), PAIR["right"])
+        contacts = field_contacts(ObjectField(object_track), capsules, frames)
         assert len(contacts.frame)
         np.testing.assert_allclose(np.linalg.norm(contacts.normal, axis=1), 1, atol=1e-9)
-        assert np.isfinite(load.carried_fraction([capsules_or_nan(hand.take(load.frames), PAIR["right"])]))
-        without_gradient = replace(load, field=ZeroGradientField())
-        assert not len(without_gradient._contacts(capsules_or_nan(hand.take(load.frames), PAIR["right"])).frame)
+        without_gradient = field_contacts(ZeroGradientField(), capsules, frames)  # pyright: ignore[reportArgumentType]
+        assert not len(without_gradient.frame)
 
 
 def test_a_hand_with_a_shape_per_frame_is_refined():
