@@ -118,12 +118,10 @@ class HoiDataset(Dataset):
     """The clips of one subset as :class:`ClipSample`, at most ``max_frames`` long. Samples are kept in memory.
 
     Args:
-        annotated: the clips.
         split: subset of the chosen split.
         max_frames: length of the window.
         crop: "random" samples a window from (seed, epoch, index), so that it does not depend on the order of access;
             "start" takes the first frames.
-        seed: seed of the windows.
     """
 
     def __init__(

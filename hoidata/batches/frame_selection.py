@@ -25,11 +25,6 @@ class FrameSelection:
         return cls(np.zeros((n_clips, 0), np.int64), 0)
 
     @classmethod
-    def everything(cls, lengths: Sequence[int]) -> "FrameSelection":
-        """Select all frames of the longest clip, and all entries."""
-        return cls(np.tile(np.arange(max(lengths)), (len(lengths), 1)))
-
-    @classmethod
     def drawn(cls, lengths: Sequence[int], count: int, at_most: int, random: np.random.Generator) -> "FrameSelection":
         """Stratified sampling: one frame from each of ``count`` equal intervals of each clip."""
         column = np.asarray(lengths)[:, None]
@@ -37,13 +32,9 @@ class FrameSelection:
         return cls(np.minimum(frames, column - 1), at_most, random)
 
     def entries(self, clips: Sequence[DistanceEntries]) -> tuple[np.ndarray, np.ndarray]:
-        """Read the entries of the selected frames; with ``at_most``, a uniform sample with replacement.
+        """Read the selected frames of entries sorted by frame; with ``at_most``, a uniform sample with replacement.
 
-        Args:
-            clips: entries of each clip, sorted by frame.
-
-        Returns:
-            (entry, 5) int64 columns clip, side, index in ``frames``, joint, point; and (entry,) distances in metres.
+        Returns (entry, 5) int64 columns clip, side, index in ``frames``, joint, point; and (entry,) distances, metres.
         """
         if not self.frames.shape[1] or self.at_most == 0:
             return np.zeros((0, 5), np.int64), np.zeros(0, np.float32)

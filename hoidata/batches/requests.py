@@ -119,13 +119,7 @@ def bucket_by_length(requests: Sequence[Request]) -> list[list[int]]:
 
 
 def conditions(items: Sequence[Any], objects: Sequence[ObjectModel], lengths: np.ndarray) -> dict[str, Any]:
-    """Collect the fields of a :class:`RequestBatch`, except the text.
-
-    Args:
-        items: B requests or samples.
-        objects: object model of each.
-        lengths: (B,) number of frames of each.
-    """
+    """Collect the fields of a :class:`RequestBatch`, except the text, of requests or samples with (B,) ``lengths``."""
     hinges = [model.hinge for model in objects]
     joints = [joint_vectors(model) for model in objects]
     arrays = {

@@ -228,11 +228,7 @@ class Clip:
         return np.diff(self.source_frames, prepend=self.source_frames[:1] - 1) != 0
 
     def take(self, frames: Frames) -> "Clip":
-        """Select frames as a clip with the same id.
-
-        Args:
-            frames: a slice, or (frame,) numbers counted from 0. Their spacing is not checked.
-        """
+        """Select frames as a clip with the same id; the spacing of frames is not checked."""
         return replace(
             self,
             hands={side: track.take(frames) for side, track in self.hands.items()},

@@ -32,7 +32,6 @@ def hand_features(track: HandTrack, model_from_world: np.ndarray, origin_m: np.n
     """Return the features (frame, 99) float32 of one hand in the model frame.
 
     Args:
-        track: the hand.
         model_from_world: (3, 3) rotation.
         origin_m: (3,) origin of the model frame, metres, world frame.
     """

@@ -59,40 +59,38 @@ class SourceHand:
 
 @dataclass(frozen=True)
 class FrameChange:
-    """``x_new = rotation @ x_old + translation_m`` per frame; by default the identity."""
+    """``x_new = rotation @ x_old + translation_m`` per frame."""
 
-    rotation: np.ndarray | None = None  # (1 or frame, 3, 3)
-    translation_m: np.ndarray | None = None  # (1 or frame, 3)
+    rotation: np.ndarray  # (1 or frame, 3, 3)
+    translation_m: np.ndarray | None = None  # (1 or frame, 3); None for zero
 
     def points(self, points_m: np.ndarray) -> np.ndarray:
         """Transform one point per frame (frame, 3)."""
-        if self.rotation is None:
-            return points_m
         moved = (self.rotation @ points_m[..., None])[..., 0]
         return moved if self.translation_m is None else moved + self.translation_m
 
     def rotvecs(self, rotvec: np.ndarray) -> np.ndarray:
         """Transform one axis-angle per frame (frame, 3): ``rotation @ R``."""
-        if self.rotation is None:
-            return rotvec
         return rotmat_to_rotvec(self.rotation @ rotvec_to_rotmat(np.asarray(rotvec, dtype=np.float64)))
 
 
-SAME_FRAME = FrameChange()
-
-
 def to_track(
-    source: SourceHand, convention: HandConvention, model: HandModel, change: FrameChange = SAME_FRAME
+    source: SourceHand, convention: HandConvention, model: HandModel, change: FrameChange | None = None
 ) -> HandTrack:
-    """Convert to absolute parameters in the world frame, float32. change: world from the source's frame."""
+    """Convert to absolute parameters in the world frame, float32. change: world from the source's frame, if it differs.
+
+    Raises BadInput if the number of finger parameters differs from the convention.
+    """
     valid = np.ones(len(source.translation_m), dtype=bool) if source.valid is None else np.asarray(source.valid, bool)
     source = _only_valid(source, valid)
-    wrist = np.asarray(source.translation_m, dtype=np.float64)
+    wrist_m, global_orient = np.asarray(source.translation_m, dtype=np.float64), source.global_orient
     if convention.translation == "transl":
-        wrist = wrist + model.wrist_offset_m(source.betas, source.template_m)
+        wrist_m = wrist_m + model.wrist_offset_m(source.betas, source.template_m)
+    if change is not None:
+        wrist_m, global_orient = change.points(wrist_m), change.rotvecs(global_orient)
     return hand_track(
-        wrist_m=change.points(wrist),
-        global_orient=change.rotvecs(source.global_orient),
+        wrist_m=wrist_m,
+        global_orient=global_orient,
         hand_pose=absolute_fingers(source.fingers, convention, model),
         betas=source.betas,
         valid=valid,

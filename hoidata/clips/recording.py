@@ -18,9 +18,8 @@ class SourceHandTrack(Track):
     PER_FRAME: ClassVar = ("wrist_m", "rotvec")
 
     wrist_m: np.ndarray  # (frame, 3) metres
-    rotvec: (
-        np.ndarray
-    )  # (frame, joint, 3) axis-angles, radians: world_from_wrist, then joints relative to their parents
+    # (frame, joint, 3) axis-angles, radians: world_from_wrist, then joints relative to their parents
+    rotvec: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,6 @@ def touched_parts(
     """Return (n_frames, 21): the object part that each joint of a hand touches, -1 for none.
 
     Args:
-        n_frames: number of frames.
         frame, joint, distance_m: (entry,) joints close to a sampled point.
         part: (entry,) object part of that point.
     """
@@ -33,7 +32,6 @@ def joint_slips_cm_s(track: ObjectTrack, joints_m: np.ndarray, touched: np.ndarr
     ``MOVING_CM_S`` at the joint.
 
     Args:
-        track: motion of the object.
         joints_m: (frame, 21, 3) joints of one hand, world.
         touched: result of ``touched_parts``.
     """

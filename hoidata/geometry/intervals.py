@@ -45,11 +45,7 @@ def sudden_steps(step: np.ndarray, notable: float, large: float, ratio: float, n
     The motion around a step is the median of ``2 * neighbours + 1`` steps, mirrored at the ends. So a glitch of one or
     two frames does not affect it.
 
-    Args:
-        step: (step,) sizes >= 0 in the unit of ``notable`` and ``large``.
-
-    Returns:
-        (step,) bool.
+    step: (step,) sizes >= 0 in the unit of ``notable`` and ``large``. Returns (step,) bool.
     """
     if not len(step):
         return np.zeros(0, dtype=bool)

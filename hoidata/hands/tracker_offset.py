@@ -32,12 +32,8 @@ def tracker_from_wrist(
 ) -> RigidTransform:
     """The mean offset over the frames in which the tracker rests.
 
-    Args:
-        sheet_from_tracker: (frame,) poses, every ``step_s`` seconds.
-        source: of the recording, for errors.
-
-    Raises:
-        BadInput: the tracker moved, or is too far from the wrist joint.
+    sheet_from_tracker: (frame,) poses, every ``step_s`` seconds. Raises BadInput, with the ``source``, if the tracker
+    moved or is too far from the wrist joint.
     """
     offsets = sheet_from_tracker.inverse() @ sheet_from_wrist(hand)
     rests = is_near_median(offsets)

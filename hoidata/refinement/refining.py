@@ -43,11 +43,7 @@ def refine_hands(
 ) -> dict[Side, HandTrack]:
     """Refine fitted hands against the object; shapes are unchanged.
 
-    Args:
-        keypoint_ids: as in ``fit_hands``.
-        generated: as in ``fit_hands``.
-        tracks: the start, as returned by ``fit_hands``.
-        object_track: the object's motion, with equally many frames.
+    ``tracks`` are the start, as returned by ``fit_hands`` for the same keypoints; the object has equally many frames.
 
     Raises BadInput: arrays of inconsistent shapes or lengths.
     """
