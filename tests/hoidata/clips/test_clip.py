@@ -9,11 +9,6 @@ from hoidata.clips.validation import check_clip
 START, STOP = 5, 17
 
 
-@pytest.fixture
-def cuts(clips) -> list[tuple[Clip, Clip]]:
-    return [(clip, clip.take(slice(START, STOP))) for clip in clips]
-
-
 def per_frame(clip: Clip) -> dict[str, np.ndarray]:
     """Every array of a clip that has one row per frame."""
     arrays = {"source_frames": clip.source_frames}
@@ -32,30 +27,6 @@ def per_frame(clip: Clip) -> dict[str, np.ndarray]:
     return arrays
 
 
-def test_every_array_is_cut_to_the_same_frames(cuts):
-    field_names = set()
-    for whole, part in cuts:
-        before, after = per_frame(whole), per_frame(part)
-        assert list(before) == list(after)
-        for name, array in before.items():
-            assert len(array) == whole.n_frames
-            np.testing.assert_array_equal(after[name], array[START:STOP], err_msg=name)
-        field_names |= set(before)
-    expected_names = {"left betas", "object 2 rotvec", "object 0 hinge_rad", "camera images", "body expression"}
-    assert expected_names <= field_names
-
-
-def test_constant_fields_are_unchanged(cuts):
-    for whole, part in cuts:
-        assert check_clip(part) is part
-        assert (part.clip_id, part.n_frames, part.source_fps) == (whole.clip_id, STOP - START, whole.source_fps)
-        for side in SIDES:
-            assert part.hands[side].template_m is whole.hands[side].template_m
-            if len(whole.hands[side].betas) == 1:
-                assert part.hands[side].betas is whole.hands[side].betas
-        assert part.object.model is whole.object.model
-
-
 def entries(clip: Clip) -> set[tuple[int, int, int]]:
     contact = clip.source_contact
     assert contact is not None
@@ -64,24 +35,33 @@ def entries(clip: Clip) -> set[tuple[int, int, int]]:
     }
 
 
-def test_contacts_are_selected_and_renumbered_from_the_first_frame(cuts):
-    touched = [(whole, part) for whole, part in cuts if whole.source_contact is not None]
-    at_the_edges = {START - 1, START, STOP - 1, STOP}
-    assert at_the_edges <= {frame for whole, _ in touched for frame, _, _ in entries(whole)}
-    for whole, part in touched:
-        expected = {(f - START, v, label) for f, v, label in entries(whole) if START <= f < STOP}
-        assert entries(part) == expected
-
-
-def test_frames_may_be_taken_by_number_in_any_order_with_their_contacts(clips):
-    frame_numbers = np.array([STOP, START, START - 1])
+@pytest.mark.parametrize("frames", [slice(START, STOP), np.array([STOP, START, START - 1])], ids=["slice", "numbers"])
+def test_arrays_and_contacts_are_those_of_the_frames_in_their_order(clips, frames):
+    fields, touched = set(), set()
     for whole in clips:
-        taken = whole.take(frame_numbers)
-        for name, array in per_frame(whole).items():
-            np.testing.assert_array_equal(per_frame(taken)[name], array[frame_numbers], err_msg=name)
+        part, numbers = whole.take(frames), np.arange(whole.n_frames)[frames]
+        before, after = per_frame(whole), per_frame(part)
+        assert list(before) == list(after)
+        for name, array in before.items():
+            assert len(array) == whole.n_frames
+            np.testing.assert_array_equal(after[name], array[frames], err_msg=name)
+        fields |= set(before)
         if whole.source_contact is not None:
-            expected = {
-                (new, v, label) for new, old in enumerate(frame_numbers) for f, v, label in entries(whole) if f == old
-            }
-            assert entries(taken) == expected
-            assert taken.source_contact.frame.dtype == whole.source_contact.frame.dtype
+            old = entries(whole)
+            assert entries(part) == {(new, v, label) for new, n in enumerate(numbers) for f, v, label in old if f == n}
+            assert part.source_contact.frame.dtype == whole.source_contact.frame.dtype
+            touched |= {frame for frame, _, _ in old}
+    assert {"left betas", "object 2 rotvec", "object 0 hinge_rad", "camera images", "body expression"} <= fields
+    assert {START - 1, START, STOP - 1, STOP} <= touched
+
+
+def test_constant_fields_are_unchanged(clips):
+    for whole in clips:
+        part = whole.take(slice(START, STOP))
+        assert check_clip(part) is part
+        assert (part.clip_id, part.n_frames, part.source_fps) == (whole.clip_id, STOP - START, whole.source_fps)
+        for side in SIDES:
+            assert part.hands[side].template_m is whole.hands[side].template_m
+            if len(whole.hands[side].betas) == 1:
+                assert part.hands[side].betas is whole.hands[side].betas
+        assert part.object.model is whole.object.model

@@ -1,4 +1,4 @@
-"""The feature layout, slip and recordings of clips, against independent formulas."""
+"""The feature layout and slip of clips, against independent formulas."""
 
 from dataclasses import replace
 
@@ -6,14 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.clips import SIDES
 from hoidata.clips.clip import FPS, ObjectTrack
 from hoidata.clips.features import hand_features, object_features, upright
-from hoidata.clips.recording import HandRecording, SourceHandTrack
 from hoidata.clips.slip import MOVING_CM_S, joint_slips_cm_s, touched_parts
-from hoidata.hands import load_embedded_hands
 from hoidata.hands.kinematics import track_rotmats
-from hoidata.sensors.mano_hand import mano_hand
 from tests.builders.clips import build_clip
 from tests.builders.objects import box_model
 
@@ -84,33 +80,3 @@ def test_a_joint_touches_the_part_of_its_nearest_point_in_whatever_order_entries
         np.testing.assert_array_equal(touched, expected)
     nothing = np.zeros(0, int)
     assert (touched_parts(3, nothing, nothing, np.zeros(0), nothing) == -1).all()
-
-
-def test_frames_of_a_recording_keep_hands_object_and_usable_together():
-    clip, hand = build_clip(), mano_hand(load_embedded_hands(), "right")
-    rng = np.random.default_rng(0)
-    joints = len(hand.parents) if hasattr(hand, "parents") else 16
-    tracks = {side: SourceHandTrack(rng.normal(size=(30, 3)), rng.normal(0, 0.3, (30, joints, 3))) for side in SIDES}
-    usable = np.arange(30) != 4
-    whole = HandRecording(
-        dataset="test",
-        subject="s1",
-        sequence="a",
-        fps=60.0,
-        hand=hand,
-        hands=tracks,
-        object=clip.object,
-        usable=usable,
-        gravity=np.array([0.0, 0, -1]),
-    )
-    every_second = whole.take(slice(0, 30, 2))
-    np.testing.assert_array_equal(every_second.usable, usable[::2])
-    np.testing.assert_array_equal(every_second.object.translation_m, clip.object.translation_m[::2])
-    for side in SIDES:
-        np.testing.assert_array_equal(every_second.hands[side].rotvec, tracks[side].rotvec[::2])
-        wrist = whole.world_from_wrist(side)
-        turned = Rotation.from_rotvec(tracks[side].rotvec[:, 0]).apply(np.tile([0.1, 0.2, 0.3], (30, 1)))
-        point = wrist @ np.tile([0.1, 0.2, 0.3], (30, 1, 1))
-        np.testing.assert_allclose(point[:, 0], turned + tracks[side].wrist_m, atol=1e-9)
-    assert whole.tracked_hand("right") is hand
-    assert whole.tracked_hand("left") is not hand
