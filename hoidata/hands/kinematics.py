@@ -50,7 +50,6 @@ class HandKinematics(nn.Module):
     def __init__(self, model: HandModel, dtype: torch.dtype = torch.float32) -> None:
         """dtype: torch.float32 or torch.float64, of the buffers and of all inputs."""
         super().__init__()
-        self.side, self.digest = model.side, model.digest
         arrays = {name: getattr(model, name) for name in ("template_m", "joint_regressor", "joint_directions")}
         arrays["rest_joints_m"] = model.joint_regressor @ model.template_m
         for name, value in arrays.items():

@@ -36,13 +36,16 @@ def tasks_of(dataset: str, seed: int, size: Size) -> list[_Task]:
 
 def make_action(task: _Task) -> list[tuple[int, TruthSequence]]:
     """Generate the sequences of one action, with their positions in the plan."""
-    pair = load_embedded_hands()
+    pair, stream = load_embedded_hands(), [task.seed, DATASET_IDS[task.dataset]]
     order = subjects(task.dataset, task.size)
     names = sorted({entry.subject for _, entry in task.entries}, key=order.index)
-    people = [_person(task, name, pair) for name in names]
+    people = [
+        make_person(task.dataset, name, pair, np.random.default_rng([*stream, _PERSON_STREAM, subject_number(name)]))
+        for name in names
+    ]
     action = ACTIONS[task.dataset][task.action]
     spec, model = object_spec(task.dataset, action.object_name), object_model(task.dataset, action.object_name)
-    rng = np.random.default_rng([task.seed, DATASET_IDS[task.dataset], _POOL_STREAM, task.action])
+    rng = np.random.default_rng([*stream, _POOL_STREAM, task.action])
     betas = np.stack([person.betas for person in people])
     pool = search_pool(Scene(spec, model, action.grasp.hinge_rad), action.grasp, pair, betas, rng)
     drawn = dict(zip(names, zip(people, pool, strict=True), strict=True))
@@ -51,11 +54,6 @@ def make_action(task: _Task) -> list[tuple[int, TruthSequence]]:
 
 def subject_number(subject: str) -> int:
     return int("".join(filter(str.isdigit, subject)))
-
-
-def _person(task: _Task, subject: str, pair: HandPair) -> Person:
-    rng = np.random.default_rng([task.seed, DATASET_IDS[task.dataset], _PERSON_STREAM, subject_number(subject)])
-    return make_person(task.dataset, subject, pair, rng)
 
 
 def _sound_sequence(

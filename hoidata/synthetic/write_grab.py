@@ -72,8 +72,12 @@ def write_grab_sequence(root: Path, members: list[TruthSequence], pair: HandPair
     for side in SIDES:
         parameters = _hand_parameters(truth.hands[side], pair, side)
         arrays[f"{side[0]}hand"] = {"params": parameters, "vtemp": _template_path(truth.subject, side)}
-    arrays["object"] = {"params": _object_parameters(truth), "object_mesh": f"{_MESHES}/{truth.object_name}.ply"}
-    arrays["table"] = {"params": _table_parameters(truth), "table_mesh": f"{_MESHES}/table.ply"}
+    track, zeros = truth.object, np.zeros((truth.n_frames, 3), dtype=np.float32)
+    pose = {"transl": track.translation_m.astype(np.float32), "global_orient": (-track.rotvec).astype(np.float32)}
+    arrays["object"] = {"params": pose, "object_mesh": f"{_MESHES}/{truth.object_name}.ply"}
+    # The table top is at height 0. Stands below objects are not part of the format.
+    table_pose = {"transl": zeros, "global_orient": zeros.copy()}
+    arrays["table"] = {"params": table_pose, "table_mesh": f"{_MESHES}/table.ply"}
     no_contact = np.zeros((truth.n_frames, _BODY_VERTICES), dtype=np.int8)
     arrays["contact"] = {"object": _object_contact(truth, pair), "body": no_contact}
     write_npz(root / "grab" / f"{truth.source_key}.npz", arrays)
@@ -91,17 +95,6 @@ def _hand_parameters(track: HandTrack, pair: HandPair, side: Side) -> dict[str, 
     parameters = {"global_orient": track.global_orient, "hand_pose": projected}
     parameters |= {"transl": track.wrist_m - rest_wrist, "fullpose": track.hand_pose}
     return {name: value.astype(np.float32) for name, value in parameters.items()}
-
-
-def _object_parameters(truth: TruthSequence) -> dict[str, np.ndarray]:
-    track = truth.object
-    return {"transl": track.translation_m.astype(np.float32), "global_orient": (-track.rotvec).astype(np.float32)}
-
-
-def _table_parameters(truth: TruthSequence) -> dict[str, np.ndarray]:
-    """The table top is at height 0. Stands below objects are not part of the format."""
-    zeros = np.zeros((truth.n_frames, 3), dtype=np.float32)
-    return {"transl": zeros, "global_orient": zeros.copy()}
 
 
 def _object_contact(truth: TruthSequence, pair: HandPair) -> np.ndarray:
