@@ -13,7 +13,8 @@ from hoidata.refinement.grasp_solver import CLEAR_M, GraspObjective
 from hoidata.refinement.kernels import N_UNKNOWNS, add_squares
 from hoidata.refinement.object_field import ObjectField
 from hoidata.refinement.skin import HandPose, SkinnedHand
-from tests.builders.objects import hinged_box, igl_signed_m
+from tests.builders.clips import still_object
+from tests.builders.objects import box_model, hinged_box, igl_signed_m
 
 FRAMES = 3
 IDS = np.array([0, 5, 100, 317, 445, 556, 673, 745, 760])
@@ -70,6 +71,19 @@ def test_the_field_has_the_distances_of_both_posed_parts_and_their_gradient():
     assert np.mean(np.abs(slope - (ahead - behind) / 2e-6).max(axis=-1) < 1e-3) > 0.98  # except at cell boundaries
     chosen, _ = ObjectField(object_track).distances(points_m[[2, 0]], np.array([2, 0]))
     assert np.array_equal(chosen, distance[[2, 0]])
+
+
+@pytest.mark.parametrize("sizes_m", [(0.3, 0.2, 0.003), (1.4, 0.025, 0.025), (0.06, 0.06, 0.06), (2.0, 0.5, 0.02)])
+def test_distances_of_any_proportions(sizes_m):
+    """Above a face the distance is the height; inside the distance is negative."""
+    field = ObjectField(still_object(box_model(sizes_m), 1))
+    heights = np.array([-0.5 * sizes_m[2], 0.002, 0.006])
+    points_m = np.stack(
+        (0.31 * sizes_m[0] + 0 * heights, 0.1 * sizes_m[1] + 0 * heights, 0.5 * sizes_m[2] + heights), 1
+    )
+    distance = field.distances(points_m[None])[0][0]
+    np.testing.assert_allclose(distance[1:], heights[1:], atol=0.001)
+    assert distance[0] < 0
 
 
 def test_the_banded_system_equals_the_dense_one():

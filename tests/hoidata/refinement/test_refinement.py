@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
+from trimesh import remesh
 
 from hoidata.clips.clip import SIDES, HandTrack, ObjectTrack, Side
 from hoidata.errors import BadInput
@@ -177,23 +178,14 @@ def test_an_inactive_hand_is_not_moved_out_of_the_object(scene):
 
 @pytest.mark.slow
 def test_the_triangulation_of_the_object_has_no_effect(scene):
-    mesh = BOX
+    vertices_m, faces = BOX.vertices_m, BOX.faces
     for _ in range(4):
-        mesh = _quartered(mesh)
-    assert len(mesh.faces) == 12 * 4**4
+        vertices_m, faces, *_ = remesh.subdivide(vertices_m, faces)
+    assert len(faces) == 12 * 4**4
+    mesh = ObjectModel("box", np.asarray(vertices_m), np.asarray(faces), np.zeros(len(vertices_m), np.uint8))
     finer = refined(scene["generated"], scene["fitted"], mesh)
     for side in SIDES:
         assert np.abs(skin(side, finer[side]) - skin(side, scene["refined"][side])).max() < 1e-4
-
-
-def _quartered(model: ObjectModel) -> ObjectModel:
-    corners = model.vertices_m[model.faces]
-    middles = (corners + np.roll(corners, -1, axis=1)) / 2
-    a, b, c = corners.swapaxes(0, 1)
-    ab, bc, ca = middles.swapaxes(0, 1)
-    quarters = (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
-    faces = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
-    return ObjectModel("box", faces.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), np.zeros(3 * len(faces)))
 
 
 @pytest.mark.slow
