@@ -12,10 +12,7 @@ PROFILES = ("embedded", "study", "own")
 MAX_NESTING = 2000
 KEYS = "params.yaml: "
 # Keys that the templates of dvc.yaml use. DVC reads them from the top level, so a profile cannot override them.
-TEMPLATED = (
-    *("profile", "profiles", "datasets", "families", "family_datasets", "train.preset", "train.size"),
-    *("tables.datasets", "tables.runs"),
-)
+TEMPLATED = ("profile", "profiles", "datasets", "families", "family_datasets", "train.preset", "train.size")
 
 
 def read_params(root: Path) -> dict[str, Any]:
