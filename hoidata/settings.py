@@ -14,29 +14,29 @@ from hoidata.errors import BadInput
 Config = TypeVar("Config")
 NONE = type(None)
 # Old and new names of keys of params.yaml. A file with an old name is refused, and the message has the new name.
-RENAMED_KEYS: dict[str, tuple[str, ...]] = {
-    "astray": ("perturbed_fraction",),
-    "drawn_by": ("sampled_from",),
-    "draws": ("attempts",),
-    "floor": ("min_std_fraction",),
-    "guide": ("contact_guidance",),
-    "guide_share": ("contact_guidance_fraction",),
-    "keep": ("keep_probability",),
-    "map_of": ("contact_map_target",),
-    "modulated": ("adaptive_norm",),
-    "most_m": ("max_distance_m",),
-    "object_place": ("object_reference_point",),
-    "object_turn": ("object_rotation",),
-    "parts": ("micro_batches",),
-    "rows": ("steps_per_clip",),
-    "rule": ("guidance_rule",),
-    "max_attempts": ("attempts",),
-    "refined": ("refinement",),
-    "refined_by": ("refine",),
-    "text_input": ("verb_input",),
-    "told": ("condition_on_hands",),
-    "window": ("window_frames",),
-    "windows": ("windows_per_clip",),
+RENAMED_KEYS = {
+    "astray": "perturbed_fraction",
+    "drawn_by": "sampled_from",
+    "draws": "attempts",
+    "floor": "min_std_fraction",
+    "guide": "contact_guidance",
+    "guide_share": "contact_guidance_fraction",
+    "keep": "keep_probability",
+    "map_of": "contact_map_target",
+    "modulated": "adaptive_norm",
+    "most_m": "max_distance_m",
+    "object_place": "object_reference_point",
+    "object_turn": "object_rotation",
+    "parts": "micro_batches",
+    "rows": "steps_per_clip",
+    "rule": "guidance_rule",
+    "max_attempts": "attempts",
+    "refined": "refinement",
+    "refined_by": "refine",
+    "text_input": "verb_input",
+    "told": "condition_on_hands",
+    "window": "window_frames",
+    "windows": "windows_per_clip",
 }
 
 
@@ -117,7 +117,7 @@ def check_keys(values: Mapping[str, Any], allowed: Sequence[str], source: str) -
     """Raise BadInput with the keys that are not allowed and those that are."""
     if unknown := [str(name) for name in values if name not in allowed]:
         section = key_in_file(values, unknown[0], source).removesuffix(f".{unknown[0]}")
-        new_names = [f"{name} is now {new}" for name in unknown for new in RENAMED_KEYS.get(name, ()) if new in allowed]
+        new_names = [f"{name} is now {RENAMED_KEYS[name]}" for name in unknown if RENAMED_KEYS.get(name) in allowed]
         raise BadInput(
             section, f"keys among: {', '.join(allowed)}", ", ".join(unknown), "; ".join(new_names) or "correct it"
         )

@@ -93,7 +93,7 @@ def test_a_value_below_the_minimum_is_refused():
 
 
 def test_a_renamed_key_is_refused_with_its_new_name(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(settings.RENAMED_KEYS, "cuont", ("count",))
+    monkeypatch.setitem(settings.RENAMED_KEYS, "cuont", "count")
     with pytest.raises(BadInput, match="got cuont; cuont is now count"):
         built(cuont=1)
     with pytest.raises(BadInput, match="got cuont; correct it"):
