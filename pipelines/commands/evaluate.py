@@ -34,13 +34,6 @@ def evaluate(
     out: Annotated[
         Path | None, typer.Option(help="Also write the metrics to this JSON file.", resolve_path=True)
     ] = None,
-    evaluators: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of the trained evaluators. Default: that of the reference, such as evaluators/embedded/grab.",
-            exists=True,
-        ),
-    ] = None,
     split: Annotated[str, typer.Option(help="Subset of the chosen split: train, validation or test.")] = "test",
     metrics: Annotated[str, typer.Option(help="Additional lists of metrics, separated by commas: bimart.")] = "",
 ) -> None:
@@ -53,8 +46,7 @@ def evaluate(
     from pipelines.stages.evaluate import trained_encoders
 
     # Of a dataset data/<profile>/<dataset>; the folder may not exist.
-    of_reference = reference.parents[2] / StagePaths(reference.parent.name, reference.name).evaluators
-    encoders = trained_encoders(evaluators or of_reference)
+    encoders = trained_encoders(reference.parents[2] / StagePaths(reference.parent.name, reference.name).evaluators)
     hands, chosen_metrics = hands_of_data(reference), select_metrics(filter(None, metrics.split(",")))
     results = evaluate_store(
         store, reference, hands, split=split, metrics=chosen_metrics, encoders=encoders, jobs=jobs(), progress=True
@@ -79,7 +71,6 @@ def compare(
     reference: Annotated[
         Path, typer.Argument(help="The annotated dataset to compare with.", exists=True, resolve_path=True)
     ],
-    clips: Annotated[int, typer.Option(min=1, help="Clips of each corpus, evenly chosen, at most.")] = 400,
     out: Annotated[Path | None, typer.Option(help="Also write all values as JSON.", resolve_path=True)] = None,
 ) -> None:
     """Compare the recorded motion of two corpora: fingers, slip, jitter, contact, grasps, speeds, hinges."""
@@ -91,7 +82,7 @@ def compare(
     from hoidata.store.annotated import load_annotated
 
     values, others = (
-        corpus_statistics(load_annotated(folder, hands_of_data(folder)), clips) for folder in (corpus, reference)
+        corpus_statistics(load_annotated(folder, hands_of_data(folder))) for folder in (corpus, reference)
     )
     rows = compare_corpora(values, others)
     table = Table(title=f"{corpus} compared with {reference}", box=box.SIMPLE)
@@ -126,10 +117,7 @@ def table(
     typer.echo(markdown_table(folder, families, metrics.split(","), stale), nl=False)
 
 
-def controls(
-    folder: Metrics,
-    list_all: Annotated[bool, typer.Option("--all", help="Also list comparisons that were not measured.")] = False,
-) -> None:
+def controls(folder: Metrics) -> None:
     """Check that each negative control has worse metrics than the recorded clips or a model.
 
     The exit code is 1 if one has not.
@@ -139,7 +127,7 @@ def controls(
     console, broken = table_console(160), 0
     for dataset in datasets_below(folder):
         results = check_orderings(read_methods(dataset))
-        console.print(_table(str(dataset), [item for item in results if list_all or item.holds is not None]))
+        console.print(_table(str(dataset), [item for item in results if item.holds is not None]))
         counts = {holds: sum(item.holds is holds for item in results) for holds in WORDS}
         typer.echo(f"{counts[True]} hold, {counts[False]} do not, {counts[None]} were not measured")
         for reason, count in sorted(Counter(item.reason for item in results if item.holds is None).items()):

@@ -53,7 +53,6 @@ def of(
     raw: Annotated[
         bool, typer.Option("--raw", help="List the raw files and frames behind it, with digests and licences.")
     ] = False,
-    clips: Annotated[bool, typer.Option("--clips", help="List all training and validation clips by id.")] = False,
 ) -> None:
     """Show all inputs of a file and whether they have changed; ``of`` can be omitted.
 
@@ -81,7 +80,7 @@ def of(
     elif raw:
         _print_raw(sources)
     else:
-        _print_tree(tree, record, clips)
+        _print_tree(tree, record)
     raise typer.Exit(0 if overall_status(tree) in ("same", "recorded") else 1)
 
 
@@ -223,7 +222,7 @@ def _print_raw(sources: list) -> None:
         typer.echo("no raw files are recorded, and the store is not here")
 
 
-def _print_tree(tree, record: dict, show_clips: bool) -> None:
+def _print_tree(tree, record: dict) -> None:
     from pipelines.lineage.tree import overall_status
 
     is_terminal = sys.stdout.isatty()
@@ -235,10 +234,10 @@ def _print_tree(tree, record: dict, show_clips: bool) -> None:
     branch = top.add("training and validation clips") if clips else top
     for split, ids in clips.items():
         names = branch.add(f"{split}: {len(ids)}")
-        for clip_id in ids if show_clips else ids[:3]:
+        for clip_id in ids[:3]:
             names.add(escape(clip_id))
-        if len(ids) > 3 and not show_clips:
-            names.add(f"and {len(ids) - 3} more (--clips lists all)")
+        if len(ids) > 3:
+            names.add(f"and {len(ids) - 3} more (--json lists all)")
     console.print(top, soft_wrap=not is_terminal)
     if libraries := record.get("libraries"):
         versions = ", ".join(f"{name} {version}" for name, version in libraries.items())

@@ -22,7 +22,6 @@ Data = Annotated[
 def show(
     clip_or_dataset: Annotated[str, typer.Argument(metavar="[CLIP]", help="Id of a clip, or a dataset.")] = "",
     out: Annotated[Path | None, typer.Option(help="Output folder. Default: .hoidata/pages.", resolve_path=True)] = None,
-    open_page: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False,
     profile: Annotated[
         str, typer.Option(help="Profile: embedded, study or own. Default: the one in params.yaml.")
     ] = "",
@@ -50,5 +49,3 @@ def show(
         expected = "a clip's id, a dataset's name, or (without --figures) --data FOLDER"
         raise BadInput("hoidata show", expected, clip_or_dataset or "none", "name one")
     typer.echo("\n".join(map(str, pages)))
-    if open_page:
-        typer.launch(pages[0].resolve().as_uri())

@@ -20,5 +20,5 @@ def test_any_text_is_one_cell_of_plain_text_in_a_table_of_markdown():
 @pytest.mark.parametrize("name", ["[/red]", "[link=file:///etc/passwd]x[/link]"])
 def test_the_libraries_a_checkpoint_names_are_text_in_a_terminal(name, capsys):
     tree = Node("motion", "x", "same")
-    _print_tree(tree, {"libraries": {name: "1"}}, show_clips=False)
+    _print_tree(tree, {"libraries": {name: "1"}})
     assert f"libraries: {name} 1" in capsys.readouterr().out
