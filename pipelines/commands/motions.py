@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from hoidata.errors import BadInput
 from pipelines.commands.project import enter_project, hands_of
 from pipelines.params import read_params
 
@@ -155,7 +156,6 @@ def generate(
     )
     project = ("", ()) if models else _project(profile)
     from hoidata.clips.clip import FPS
-    from hoidata.errors import BadInput
     from models.text2hoi.generation import MotionOptions
     from pipelines.command_inputs import MeshOptions
     from pipelines.generation import GenerationRequest, generate_files
@@ -183,8 +183,6 @@ def generate(
 def _refuse_ineffective(options: Mapping[str, Any]) -> None:
     """Raise BadInput for options that are set but have no effect in this call."""
     if ineffective := [name for name, value in options.items() if value]:
-        from hoidata.errors import BadInput
-
         expected = (
             "--model and --profile in a project, --encoder with --models, --hand-by without --hand, --unit, --up, "
             "--hinge, --moving and --scale with an existing mesh file"
