@@ -34,9 +34,9 @@ def until(holds: Callable[[], bool], seconds: float = WAIT_S) -> None:
         time.sleep(0.02)
 
 
-def is_at_work(pid: int) -> bool:
+def is_at_work(process: psutil.Process) -> bool:
     try:
-        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+        return process.status() != psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:
         return False
 
@@ -94,7 +94,7 @@ time.sleep(60)
 @pytest.mark.parametrize("how", [BY_THE_KERNEL, BY_A_THREAD, BY_NUMBER], ids=["kernel", "thread", "number"])
 def test_a_process_ends_when_its_parent_is_killed(how: str) -> None:
     parent = started(how)
-    children = [int(word) for word in parent.first_line]  # pyright: ignore
+    children = [psutil.Process(int(word)) for word in parent.first_line]  # pyright: ignore
     assert children
     assert all(map(is_at_work, children))
     parent.kill()

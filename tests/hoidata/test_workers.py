@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -17,6 +16,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from hoidata.errors import BadInput
 from hoidata.workers import WorkerDied, map_in_workers
+from tests.hoidata.test_lifetime import is_at_work, until
 
 
 def squared(item: int) -> int:
@@ -146,10 +146,7 @@ def test_worker_processes_end_with_their_parent(tmp_path, code, count, sent):
     )
     workers = [psutil.Process(int(starter.stdout.readline())) for _ in range(count)]
     starter.send_signal(sent)
-    deadline = time.monotonic() + 30
-    while any(worker.is_running() and worker.status() != psutil.STATUS_ZOMBIE for worker in workers):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    until(lambda: not any(map(is_at_work, workers)), 30)
     starter.kill()
     starter.communicate()
 

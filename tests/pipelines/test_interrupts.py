@@ -7,12 +7,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import psutil
 import pytest
 
+from tests.hoidata.test_lifetime import is_at_work, until
 from tests.pipelines.test_parallel_repro import PROJECT, tiny_project
 
 MARK = "HOIDATA_TEST_RUN"  # an environment variable that all processes of a run inherit
@@ -43,19 +43,6 @@ def processes_of(mark: str) -> list[psutil.Process]:
             if process.environ().get(MARK) == mark:
                 processes.append(process)
     return [process for process in processes if is_at_work(process)]
-
-
-def is_at_work(process: psutil.Process) -> bool:
-    with contextlib.suppress(psutil.NoSuchProcess):
-        return process.status() != psutil.STATUS_ZOMBIE
-    return False
-
-
-def until(holds: Callable[[], object], seconds: float) -> None:
-    deadline = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 class Run:

@@ -12,7 +12,7 @@ import pytest
 from hoidata import processor
 from hoidata.processor import portable_kernels, processor_name
 from pipelines.warm import KILLED, SOCKET, WarmProcess, run_warm
-from tests.pipelines.test_interrupts import until
+from tests.hoidata.test_lifetime import until
 
 ACT = """
 import os, signal, sys, time

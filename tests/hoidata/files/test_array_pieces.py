@@ -12,6 +12,7 @@ import pytest
 
 from hoidata.errors import BadInput
 from hoidata.files.array_pieces import locate_arrays, npz_members
+from tests.hoidata.files.test_restricted_pickle import Call
 
 
 def save(path: Path, content, protocol: int = 3, old_names: bool = False) -> Path:
@@ -96,19 +97,12 @@ def test_pieces_say_which_row_they_start_at_and_memory_stays_small(tmp_path):
     assert peak < 30e6
 
 
-class Runs:
-    def __init__(self, marker: Path) -> None:
-        self.marker = marker
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.marker),)
-
-
 @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
 @pytest.mark.parametrize("inside", [True, False])
 def test_a_pickle_with_a_call_is_refused_and_executes_nothing(tmp_path, protocol, inside):
     marker, values = tmp_path / "ran", np.zeros((100, 100))
-    content = {"object": values, "extra": Runs(marker)} if inside else Runs(marker)
+    call = Call(os.mkdir, str(marker))
+    content = {"object": values, "extra": call} if inside else call
     with pytest.raises(BadInput) as caught:
         locate_arrays(save(tmp_path / "a.npz", content, protocol), "contact")
     assert "not allowed" in caught.value.got

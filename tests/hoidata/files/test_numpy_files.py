@@ -23,6 +23,7 @@ from hoidata.files.checksums import (
 )
 from hoidata.files.npy_header import read_npy_header
 from hoidata.files.numpy_files import load_npz_arrays
+from tests.hoidata.files.test_restricted_pickle import Call
 
 
 def npy_of_numpy_1(value):
@@ -86,18 +87,10 @@ def test_only_the_named_members_are_read_and_must_exist(tmp_path):
         load_npz_objects(tmp_path / "s.npz", {"lhand"})
 
 
-class Malicious:
-    def __init__(self, target):
-        self.target = target
-
-    def __reduce__(self):
-        return open, (str(self.target), "w")
-
-
 @pytest.mark.parametrize("reader", [load_npy, load_npy_object])
 def test_npy_with_a_call_inside_is_refused_and_nothing_runs(tmp_path, reader):
     trace = tmp_path / "trace"
-    np.save(tmp_path / "a.npy", np.array({"a": Malicious(trace)}, dtype=object), allow_pickle=True)
+    np.save(tmp_path / "a.npy", np.array({"a": Call(open, str(trace), "w")}, dtype=object), allow_pickle=True)
     with pytest.raises(BadInput):
         reader(tmp_path / "a.npy")
     assert not trace.exists()
@@ -105,7 +98,7 @@ def test_npy_with_a_call_inside_is_refused_and_nothing_runs(tmp_path, reader):
 
 def test_npz_with_a_call_inside_is_refused_by_member_and_nothing_runs(tmp_path):
     trace = tmp_path / "trace"
-    np.savez(tmp_path / "a.npz", body=np.array({"a": Malicious(trace)}, dtype=object))
+    np.savez(tmp_path / "a.npz", body=np.array({"a": Call(open, str(trace), "w")}, dtype=object))
     with pytest.raises(BadInput, match=r"a\.npz: body: .*open"):
         load_npz_objects(tmp_path / "a.npz")
     assert not trace.exists()

@@ -12,6 +12,7 @@ import torch
 
 from hoidata.errors import BadInput
 from hoidata.files import load_torch_pickle, torch_pickle
+from tests.hoidata.files.test_restricted_pickle import Call
 
 
 def hand_file():
@@ -119,16 +120,6 @@ def test_torch_is_imported_only_where_a_tensor_is_read():
     code = "import sys, hoidata.files; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False"]
-
-
-class Call:
-    """Pickles as a call of ``function`` with ``arguments``."""
-
-    def __init__(self, function, *arguments):
-        self.function, self.arguments = function, arguments
-
-    def __reduce__(self):
-        return self.function, self.arguments
 
 
 def saved(value, zipped: bool) -> bytes:
