@@ -13,6 +13,7 @@ from hoidata.quality.stage import quality_store
 from hoidata.splits.stage import split_store
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
+from tests.builders.clips import build_clip
 
 BY_SUBJECT = {"by": "subject", "train": "rest", "validation": ["s2"], "test": ["s3"]}
 
@@ -44,3 +45,14 @@ def write_annotated(
     contact_store(root / "clips", root / "contact", contact)
     split_store(root / "clips", root / "annotation", root / "splits", rule or BY_SUBJECT)
     return root
+
+
+def write_two_verbs(root: Path) -> list[Clip]:
+    """Write and annotate five clips of two verbs and three subjects, the last two of them for tests."""
+    plans = [("s1", "lift"), ("s1", "open"), ("s2", "lift"), ("s3", "lift"), ("s3", "open")]
+    clips = [
+        build_clip(20, seed=seed, clip_id=f"toy/{subject}/{seed}", subject=subject, verb=verb)
+        for seed, (subject, verb) in enumerate(plans)
+    ]
+    write_annotated(root, clips)
+    return clips

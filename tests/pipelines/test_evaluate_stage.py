@@ -20,8 +20,7 @@ from pipelines.stages import evaluate
 from pipelines.stages.base import StagePaths, write_empty
 from pipelines.stages.families import families_of
 from tests.builders.annotated import write_annotated_dataset
-from tests.builders.clips import build_clip
-from tests.builders.stores import write_annotated
+from tests.builders.stores import write_two_verbs
 
 PROJECT = Path(__file__).parents[2]
 PATHS = StagePaths("embedded", "grab", family="ours")
@@ -136,12 +135,7 @@ def test_without_motions_the_reason_is_written(clips):
 
 def test_the_tutorial_for_a_method_of_your_own_runs_as_typed(stage_folder):
     stage_folder(families=["ours"])
-    plans = [("s1", "lift"), ("s1", "open"), ("s2", "lift"), ("s3", "lift"), ("s3", "open")]
-    recorded = [
-        build_clip(20, seed=seed, clip_id=f"toy/{subject}/{seed}", subject=subject, verb=verb)
-        for seed, (subject, verb) in enumerate(plans)
-    ]
-    write_annotated(PATHS.data, recorded)
+    write_two_verbs(PATHS.data)
     page = (PROJECT / "docs/measure.md").read_text()
     (script,) = re.findall(r"```python\n(# Your method.*?)```", page, re.DOTALL)
     (commands,) = re.findall(r"```console\n(.*?)```", page, re.DOTALL)

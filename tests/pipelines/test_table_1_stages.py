@@ -14,8 +14,7 @@ from pipelines.stages import evaluate, sample, train
 from pipelines.stages.base import StagePaths
 from pipelines.stages.code import write_code
 from pipelines.stages.families import OPTIONAL_FAMILIES
-from tests.builders.clips import build_clip
-from tests.builders.stores import write_annotated
+from tests.builders.stores import write_two_verbs
 from tests.models.test_table_1 import NETWORKS, TINY
 from tests.models.toy import BUDGET
 
@@ -42,12 +41,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(params))
     subprocess.run(["git", "init", "-q"], check=True)
     subprocess.run([sys.executable, "-m", "dvc", "init", "-q"], check=True)
-    plans = [("s1", "lift"), ("s1", "open"), ("s2", "lift"), ("s3", "lift"), ("s3", "open")]
-    clips = [
-        build_clip(20, seed=seed, clip_id=f"toy/{subject}/{seed}", subject=subject, verb=verb)
-        for seed, (subject, verb) in enumerate(plans)
-    ]
-    write_annotated(PATHS.data, clips)
+    write_two_verbs(PATHS.data)
     return tmp_path
 
 
