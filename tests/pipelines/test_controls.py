@@ -28,7 +28,6 @@ from pipelines.expected_orderings import (
     RECORDED,
     ExpectedOrdering,
     check_orderings,
-    datasets_below,
     read_methods,
     taken_for_reverse,
 )
@@ -188,21 +187,6 @@ def test_every_ordering_without_a_model_holds_on_a_small_part_of_the_study_corpu
     )  # what needs more clips than these, as a Frechet distance, is not measured
     assert [item for item in results if item.holds is False] == []
     assert {item.ordering.control for item in results if item.holds} == {ordering.control for ordering in orderings}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("profile", ["study", "embedded"])
-def test_every_ordering_holds_on_the_metrics_in_this_folder(profile):
-    folder = PROJECT / "metrics" / profile
-    if not any(folder.rglob("controls/object-moved.json")):
-        pytest.skip(f"no control rows of the profile {profile} have been measured here")
-    broken = [
-        (dataset.name, item.ordering.control, item.ordering.metric, item.reference, item.value)
-        for dataset in datasets_below(folder)
-        for item in check_orderings(read_methods(dataset))
-        if item.holds is False
-    ]
-    assert broken == []
 
 
 def test_an_unmeasured_ordering_has_a_reason(tmp_path):

@@ -51,8 +51,7 @@ def test_the_committed_settings_are_the_defaults_of_all_adapters_but_for_embedde
 
 def test_a_dataset_may_set_its_margin(tmp_path):
     params = params_of(tmp_path, "convert: {margin_frames: 5, adapters: {arctic: {margin_frames: 2}, h2o: null}}")
-    margins = {name: getattr(params.adapter(name), "margin_frames", None) for name in ("grab", "arctic", "h2o")}
-    assert margins == {"grab": 5, "arctic": 2, "h2o": 5}
+    assert [params.adapter(name).margin_frames for name in ("grab", "arctic", "h2o")] == [5, 2, 5]
 
 
 def test_a_variant_has_the_adapter_and_raw_files_of_its_source_and_separate_settings(tmp_path, monkeypatch):
@@ -138,21 +137,20 @@ def test_params_set_the_quality_limits(stage_folder, make_clip):
     assert rows["reasons"].tolist() == ["object box: longest side of the bounding box: 0.1 m, above 0.05 m"]
 
 
-def test_empty_dataset_passes_through(stage_folder):
+def test_a_dataset_without_clips_passes_on_its_reason(stage_folder):
     write_empty(PATHS.clips, "grab is not present")
-    quality.run(PATHS)
-    assert empty_reason(PATHS.quality) == "grab is not present"
-    annotate.run(PATHS)
-    assert empty_reason(PATHS.annotation) == "grab is not present"
+    for stage, out in ((quality, PATHS.quality), (annotate, PATHS.annotation), (split, PATHS.splits)):
+        stage.run(PATHS)
+        assert empty_reason(out) == "grab is not present"
 
 
-def test_an_unknown_setting_and_an_unknown_measure_are_refused(stage_folder, make_clip):
-    write_store(PATHS.clips, [make_clip(40)], generated_info("grab"))
-    stage_folder(quality={"too_deep_mm": 10})
-    with pytest.raises(BadInput, match="too_deep_mm"):
-        quality.run(PATHS)
-    stage_folder(quality={"limits": {"jerk": {"warn": 1, "leave_out": 2}}})
-    with pytest.raises(BadInput, match="jerk"):
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [({"too_deep_mm": 10}, "too_deep_mm"), ({"limits": {"jerk": {"warn": 1, "leave_out": 2}}}, "jerk")],
+)
+def test_an_unknown_setting_and_an_unknown_measure_are_refused(stage_folder, settings, name):
+    stage_folder(quality=settings)
+    with pytest.raises(BadInput, match=name):
         quality.run(PATHS)
 
 
@@ -179,13 +177,10 @@ def annotated_with(clips, stage_folder):
     return run
 
 
-def test_threshold_and_points_of_the_contact_stage_decide_the_active_hands(annotated_with) -> None:
+def test_the_contact_stage_decides_the_active_hands_but_for_another_threshold_of_hand_types(annotated_with) -> None:
     hands, _, info = annotated_with({"threshold_m": 1e-6, "points": 64})
     assert (info["threshold_m"], info["points"]) == (1e-6, 64)
     assert hands["hand_type"].isna().all()
-
-
-def test_hand_types_may_have_another_threshold(annotated_with) -> None:
     hands, _, info = annotated_with({"threshold_m": 1e-6}, threshold_m=0.02)
     assert info["threshold_m"] == 0.02
     assert hands["hand_type"].notna().all()
@@ -290,15 +285,6 @@ def test_an_unknown_split_is_refused_with_a_list_of_the_known_ones(folder):
     with pytest.raises(BadInput, match=r"params.yaml: split.grab: expected one of: composition, .*official, text2hoi"):
         split.run(PATHS)
     assert not PATHS.splits.exists()
-
-
-def test_a_dataset_without_clips_passes_on_its_reason(folder):
-    choose_split(folder, "text2hoi")
-    empty = StagePaths("embedded", "h2o")
-    empty.annotation.mkdir(parents=True)
-    (empty.annotation / "empty.json").write_text('{"reason": "h2o is not present"}')
-    split.run(empty)
-    assert json.loads((empty.splits / "empty.json").read_text()) == {"reason": "h2o is not present"}
 
 
 def test_all_stages_that_open_the_annotated_store_depend_on_its_split(pytestconfig):
