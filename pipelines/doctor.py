@@ -14,7 +14,6 @@ from pipelines.params import PROFILES, read_params
 from pipelines.stages.adapters import manifest_of, source_of
 from pipelines.stages.base import HAND, StagePaths, load_hands, load_settings, registered_root, root_variable
 
-PYTHONS = ((3, 11), (3, 12), (3, 13))
 NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "safetensors", "dvc", "prefect")
 
 
@@ -30,18 +29,11 @@ class Finding:
 def examine() -> list[Finding]:
     """Examine everything that a run depends on, without opening raw files."""
     params = read_params(Path())
+    python = Finding("python", "ok", f"{sys.version.split()[0]}, {len(os.sched_getaffinity(0))} cores")
     profile = Finding("profile", "ok", params["profile"])
-    findings = [_python(), *map(_package, NEEDED), _prefect_server(), _gpu(), profile]
+    findings = [python, *map(_package, NEEDED), _prefect_server(), _gpu(), profile]
     findings += [_raw(kind, name) for kind in PROFILES for name in params["datasets"]]
     return [*findings, *map(_hand, PROFILES), _encoder(), _clip()]
-
-
-def _python() -> Finding:
-    text = f"{sys.version.split()[0]}, {len(os.sched_getaffinity(0))} cores"
-    if sys.version_info[:2] in PYTHONS:
-        return Finding("python", "ok", text)
-    accepted = " or ".join(f"{major}.{minor}" for major, minor in PYTHONS)
-    return Finding("python", "broken", f"{text}; hoidata needs {accepted}")
 
 
 def _package(name: str) -> Finding:

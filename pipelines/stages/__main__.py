@@ -39,12 +39,7 @@ def main() -> int:
     if (code := run_warm("pipelines.stages", sys.argv[1:])) is not None:
         return code
     os.environ.update(ENVIRONMENT)
-    try:
-        module = importlib.import_module(f"pipelines.stages.{options.stage}")
-    except ModuleNotFoundError as error:
-        print(f"{error}. Activate the environment first: source .venv/bin/activate", file=sys.stderr)
-        return 1
-    return _run(module, options)
+    return _run(importlib.import_module(f"pipelines.stages.{options.stage}"), options)
 
 
 def _end_with_dvc() -> None:

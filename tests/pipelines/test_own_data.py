@@ -3,19 +3,16 @@
 import json
 import os
 import shutil
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
-from packaging.specifiers import SpecifierSet
 from typer.testing import CliRunner, Result
 
 from hoidata.datasets import get_adapter
 from hoidata.errors import BadInput, MissingResource
 from pipelines.cli import app
-from pipelines.doctor import PYTHONS
 from pipelines.lineage.manifests import ABSENT_HAND, write_manifest
 from pipelines.stages.adapters import manifest_of
 from pipelines.stages.base import StagePaths, load_hands, raw_root
@@ -212,14 +209,6 @@ def test_commands_outside_of_a_project_are_refused(tmp_path, project_tools):
     result = project_tools.run(tmp_path, "hoidata", "doctor")
     assert result.returncode == 1
     assert "no hoidata project" in result.stderr
-
-
-@pytest.mark.slow
-def test_doctor_accepts_the_python_versions_of_the_package():
-    project = tomllib.loads((PROJECT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    accepted = SpecifierSet(project["requires-python"])
-    versions = [(3, minor) for minor in range(8, 20)]
-    assert [python for python in versions if ".".join(map(str, python)) in accepted] == list(PYTHONS)
 
 
 @pytest.mark.slow
