@@ -8,7 +8,7 @@ satisfy it. For other verbs, the limits are computed from the training clips.
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache
 from math import ceil, floor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, ObjectTrack
-from hoidata.errors import BadInput
 from hoidata.geometry.intervals import runs
 from hoidata.geometry.rotations import rotation_angles_about
 from hoidata.store.annotated import AnnotatedStore
@@ -101,7 +100,6 @@ MEASURES = {
     "last_left": "1 if the left hand grasps at the end: contact in half of the last quarter of the contact time",
     "last_right": "1 if the right hand grasps at the end",
 }
-HANDS = {"one hold": (0.0, 0.0), "change": (1.0, 2.0)}  # `hands` in actions.toml, as limits of `hand_changes`
 HAND_MEASURES = ("first_left", "first_right", "last_left", "last_right")  # a request states the hands, not the verb
 VERB_MEASURES = tuple(name for name in MEASURES if name not in HAND_MEASURES)
 MIN_CLIPS = 3  # of a verb, to compute its limits
@@ -346,19 +344,11 @@ def _standardised(numbers: Mapping[str, float], scale: Mapping[str, tuple[float,
     return np.array([(numbers[name] - mean) / deviation for name, (mean, deviation) in scale.items()])
 
 
-@lru_cache(maxsize=1)
-def written_limits(path: Path = TABLE) -> dict[str, Limits]:
-    """Read the limits of ``actions.toml`` by verb; {} without the file. Raises BadInput for an invalid table."""
-    tables = tomllib.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    return {verb: _limits(f"{path.name}: {verb}", table) for verb, table in tables.items()}
-
-
-def _limits(source: str, table: Mapping[str, Any]) -> Limits:
-    limits_of = {name: value for name, value in table.items() if name != "hands"}
-    if "hands" in table:
-        limits_of["hand_changes"] = HANDS.get(table["hands"], ())
-    for name, limits in limits_of.items():
-        if name not in MEASURES or len(limits) != 2 or not limits[0] <= limits[1]:
-            expected = f"hands: {' or '.join(HANDS)}; [least, most] of any of {', '.join(MEASURES)}"
-            raise BadInput(source, expected, f"{name} = {limits}", "correct the table")
-    return {name: (float(least), float(most)) for name, (least, most) in limits_of.items()}
+@cache
+def written_limits() -> dict[str, Limits]:
+    """Read the limits of ``actions.toml`` by verb."""
+    tables = tomllib.loads(TABLE.read_text(encoding="utf-8"))
+    return {
+        verb: {name: (float(least), float(most)) for name, (least, most) in table.items()}
+        for verb, table in tables.items()
+    }
