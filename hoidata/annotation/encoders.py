@@ -106,6 +106,13 @@ class CachedEncoder:
         return _stack([self._features[text] for text in sentences])
 
 
+def cosine_similarities(encoder: TextEncoder, text: str, others: Sequence[str]) -> np.ndarray:
+    """Return the cosine similarity of a text's features to those of each of the others."""
+    features = encoder.encode([text, *others])
+    features = features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)
+    return features[1:] @ features[0]
+
+
 def refuse_other_encoder(source: str | Path, expected: Identity, got: Identity) -> None:
     """Raise BadInput if features come from different encoders."""
     if expected != got:

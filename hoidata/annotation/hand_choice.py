@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from hoidata.annotation.encoders import TextEncoder
+from hoidata.annotation.encoders import TextEncoder, cosine_similarities
 from hoidata.annotation.grammar import default_grammar
 from hoidata.clips import SIDES, HandType, Side
 
@@ -76,9 +76,7 @@ def most_similar_hand(
     text: str, encoder: TextEncoder, templates: Mapping[HandType, str] = TEMPLATES
 ) -> tuple[HandType, float]:
     """Return the template with the highest cosine similarity, as in the paper, and its margin over the second."""
-    features = encoder.encode([text, *(templates[hand] for hand in HAND_TYPES)])
-    features = features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)
-    cosines = features[1:] @ features[0]
+    cosines = cosine_similarities(encoder, text, [templates[hand] for hand in HAND_TYPES])
     order = np.argsort(-cosines, kind="stable")
     return HAND_TYPES[order[0]], float(cosines[order[0]] - cosines[order[1]])
 

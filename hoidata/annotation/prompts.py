@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from lemminflect import getAllLemmas
 
-from hoidata.annotation.encoders import TextEncoder
+from hoidata.annotation.encoders import TextEncoder, cosine_similarities
 from hoidata.annotation.grammar import default_grammar, default_phrases
 from hoidata.annotation.hand_choice import HandChoice, select_hand
 from hoidata.annotation.sentences import ACTIONS, JOINED
@@ -41,6 +41,10 @@ class _Match:
     start: int
     stop: int
 
+    @property
+    def length(self) -> int:
+        return self.stop - self.start
+
     def overlaps(self, other: "_Match") -> bool:
         return self.start < other.stop and other.start < self.stop
 
@@ -66,9 +70,9 @@ class Lexicon:
         verbs = [verb for verb in verbs if _PURPOSE.search(rest, 0, verb.start)] or verbs
         pairs = [(verb, noun) for verb in verbs for noun in nouns if not verb.overlaps(noun)]
         if pairs:
-            verb, noun = max(pairs, key=_score)
+            verb, noun = max(pairs, key=lambda pair: (pair[0].length + pair[1].length, -pair[0].start))
             return verb.base, noun.base
-        verb = max(verbs, key=_length, default=None)
+        verb = max(verbs, key=lambda match: match.length, default=None)
         return (verb.base if verb else None), None
 
 
@@ -119,15 +123,6 @@ def _labels() -> dict[tuple[str | None, str | None], str]:
     """Map idioms that equal another verb of the table to the verb they replace: "put on" eyeglasses is "wear"."""
     said = {(phrase.said.base, noun): verb for (verb, noun), phrase in default_phrases().verbs.items()}
     return {key: verb for key, verb in said.items() if key[0] in default_grammar().verbs and key[0] != verb}
-
-
-def _length(match: _Match) -> int:
-    return match.stop - match.start
-
-
-def _score(pair: tuple[_Match, _Match]) -> tuple[int, int]:
-    verb, noun = pair
-    return _length(verb) + _length(noun), -verb.start
 
 
 LONGEST_WORDS = 60
@@ -202,7 +197,8 @@ def further_verbs(text: str, generated: str | None, vocabulary: Vocabulary) -> l
     clauses = [re.findall(r"[a-z-]+", clause) for clause in _BETWEEN_CLAUSES.split(text.lower())]
     clauses = [rest for words in clauses if (rest := words[_count_adverbs(words) :])]
     verbs = sorted(filter(None, vocabulary.verbs))
-    ordered = bool(clauses) and _is_base_form(clauses[0][0])  # "Lift ..." and not "A hand lifts ..."
+    first = clauses[0][0] if clauses else ""
+    ordered = first in getAllLemmas(first).get("VERB", ())  # "Lift ..." and not "A hand lifts ..."
     matches = []
     for number, words in enumerate(clauses):
         starts = range(1) if ordered or number else _of_no_article(words)
@@ -231,10 +227,6 @@ def _of_no_article(words: list[str]) -> list[int]:
     return [start for start in range(1, len(words)) if words[start - 1] not in ("a", "an", "the")]
 
 
-def _is_base_form(word: str) -> bool:
-    return word in getAllLemmas(word).get("VERB", ())
-
-
 def is_english(word: str) -> bool:
     """Whether a lower-case word is in lemminflect's dictionary or a function word; ASCII only."""
     return word.isascii() and (word in FUNCTION_WORDS or bool(getAllLemmas(word)))
@@ -242,9 +234,7 @@ def is_english(word: str) -> bool:
 
 def nearest_words(word: str, known: list[str], encoder: TextEncoder) -> list[str]:
     """The known words whose text features are most similar to those of ``word``, best first."""
-    features = encoder.encode([word, *known])
-    features = features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)
-    order = np.argsort(-(features[1:] @ features[0]), kind="stable")[:NAMED]
+    order = np.argsort(-cosine_similarities(encoder, word, known), kind="stable")[:NAMED]
     return [known[row] for row in order]
 
 
