@@ -1,8 +1,5 @@
 """Text encoders: identity, determinism, independence of a sentence from its neighbours, and clear refusals."""
 
-import os
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -39,16 +36,6 @@ def test_a_feature_does_not_depend_on_its_neighbours_or_the_process_history(enco
     fresh = load_encoder(str(encoder.identity["name"]))
     for sentence, feature in zip(SENTENCES, together, strict=True):
         assert fresh.encode([sentence])[0].tobytes() == feature.tobytes()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("threads", ["1", "2"])
-def test_features_are_the_same_on_any_number_of_processors(threads: str) -> None:
-    code = "import sys; from hoidata.annotation.encoders import load_encoder as f; "
-    code += f"sys.stdout.buffer.write(f('use').encode({SENTENCES!r}).tobytes())"
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=True)
-    assert done.stdout == load_encoder("use").encode(SENTENCES).tobytes()
 
 
 def test_the_default_encoder_works_on_one_blas_thread_whatever_was_set(monkeypatch: pytest.MonkeyPatch) -> None:

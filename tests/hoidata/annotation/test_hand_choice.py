@@ -1,6 +1,6 @@
 """Which hand a prompt asks for: every template, hard sentences of many kinds, and never an invented hand.
 
-Also slips of the keys, priors that are silent, and sentences written before the rules were tried on them (see the
+Also priors that are silent, and sentences written before the rules were tried on them (see the
 commit that adds the list).
 """
 
@@ -13,7 +13,6 @@ import pytest
 from hoidata.annotation.encoders import HashEncoder
 from hoidata.annotation.grammar import default_grammar
 from hoidata.annotation.hand_choice import HAND_TYPES, choose_hand, find_mentions, most_similar_hand, select_hand
-from hoidata.annotation.prompts import read_prompt
 from hoidata.annotation.sentences import english_sentences
 
 LEFT = """
@@ -37,11 +36,14 @@ slide the book from left to right with the right hand | Raise the pan using just
 grip the cup with the right palm
 Hold the phone in your right and tap it | Right-handed pour of the milk | Grip the scissors right-handedly and cut
 grasp the box without your left hand, i.e. with the right | drink from the cup held in your right hand
-use your right hadn
+use your right hadn | lift it with the rihgt hand | lift it with the right hnad | lift it with the irght hand
+lift it with the rigth hand | lift it with the rright hand | lift it with the rightt hand
+lift it with the rigght hand | lift it with the right hhand | lift it with the right handd
 lift with right hand not left hand | lift the left box with the right arm | lift a model hand with the right hand
 open the notebook using the fingers of your right hand | Fly a plane with the right hand, right over the table
 """
 BOTH = """
+lift it with obth hands | lift it with both hadns | lift it with bboth hands
 hold the box two-handed | pass it from the left hand to the right | grasp it with your hands | lift with both arms
 hold the jar in your left and twist the lid in your right | use a pair of hands | grab it with boht hands
 With one hand, open the bottle; hold it with the other. | left and right hands lift the box
@@ -128,17 +130,21 @@ def test_a_lead_below_the_margin_is_a_guess_and_not_taken(lead: float, hand: str
     assert select_hand("the hand that is left with the left one", LeaningLeft(lead)).hand == hand
 
 
-def test_a_prior_answers_last_and_is_named() -> None:
-    prior = {"left": 0.25, "right": 0.5, "both": 0.25}
-    choice = select_hand("pick up the cup", prior=prior)
-    assert (choice.hand, choice.source, choice.confidence) == ("right", "prior", 0.5)
+@pytest.mark.parametrize(
+    ("text", "prior", "hand", "confidence"),
+    [
+        ("pick up the cup", {"left": 0.25, "right": 0.5, "both": 0.25}, "right", 0.5),
+        ("lift it without using your right hand", {"left": 0.25, "right": 0.5, "both": 0.25}, "left", 1),
+        ("one hand only", {"left": 1 / 3, "right": 0.0, "both": 2 / 3}, "left", 1),
+        ("lift it with one hand", {"right": 0.6, "both": 0.4}, "right", 1),
+        ("lift it", {"right": 0.6, "both": 0.2}, "right", 0.75),
+        ("lift it", {"left": 0.0}, "left", 1 / 3),
+    ],
+)
+def test_a_prior_answers_last_and_never_with_a_hand_the_sentence_rules_out(text, prior, hand, confidence) -> None:
+    choice = select_hand(text, prior=prior)
+    assert (choice.hand, choice.source, choice.confidence) == (hand, "prior", pytest.approx(confidence))
     assert select_hand("lift it with the left hand", prior=prior).source == "rule"
-
-
-def test_a_prior_never_answers_with_a_hand_the_sentence_rules_out() -> None:
-    prior = {"left": 0.25, "right": 0.5, "both": 0.25}
-    assert select_hand("lift it without using your right hand", prior=prior).hand == "left"
-    assert select_hand("one hand only", prior={"left": 1 / 3, "right": 0.0, "both": 2 / 3}).hand == "left"
 
 
 def test_the_papers_plain_choice_always_answers_where_the_rules_do_not() -> None:
@@ -161,52 +167,8 @@ def test_the_papers_choice_is_the_most_similar_template() -> None:
         assert margin > 0
 
 
-@pytest.mark.parametrize(
-    ("text", "verb", "noun"),
-    [
-        ("Take out milk with both hands.", "take out", "milk"),
-        ("A camera is used to take a picture by the right hand.", "take a picture with", "camera"),
-        ("The left hand stamps a stamp.", "stamp", "stamp"),
-        ("A Stanford bunny is handed over by both hands.", "hand over", "Stanford bunny"),
-        ("Lift a hand with the left hand.", "lift", "hand"),
-        ("Spraying spray with the right hand.", "spray", "spray"),
-        ("Lift a water bottle with your left hand.", "lift", "water bottle"),
-        ("Frobnicate the gizmo with both hands.", None, None),
-    ],
-)
-def test_a_prompt_gives_back_its_verb_and_object(text: str, verb: str | None, noun: str | None) -> None:
-    reading = read_prompt(text)
-    assert (reading.verb, reading.object_words) == (verb, noun)
-
-
-@pytest.mark.parametrize(
-    "sentence",
-    [
-        *("lift it with the rihgt hand", "lift it with the right hnad", "lift it with the irght hand"),
-        *("lift it with the rigth hand", "lift it with the rright hand", "lift it with the rightt hand"),
-        *("lift it with the rigght hand", "lift it with the right hhand", "lift it with the right handd"),
-    ],
-)
-def test_swapped_and_doubled_letters_of_hand_words_are_mended(sentence):
-    assert find_mentions(sentence).sides == {"right"}
-
-
-@pytest.mark.parametrize("sentence", ["lift it with obth hands", "lift it with both hadns", "lift it with bboth hands"])
-def test_slips_are_mended_for_both_hands_too(sentence):
-    assert select_hand(sentence).hand == "both"
-
-
 def test_no_both_hands_are_denied_as_both():
     assert find_mentions("lift it, but not with both hands").denied == {"both"}
-
-
-def test_a_prior_counts_only_the_hands_it_knows_and_that_are_allowed():
-    choice = select_hand("lift it with one hand", prior={"right": 0.6, "both": 0.4})
-    assert (choice.hand, choice.confidence) == ("right", pytest.approx(1.0))
-    shares = select_hand("lift it", prior={"right": 0.6, "both": 0.2})
-    assert (shares.hand, shares.confidence) == ("right", pytest.approx(0.75))
-    silent = select_hand("lift it", prior={"left": 0.0})
-    assert (silent.hand, silent.confidence) == ("left", pytest.approx(1 / 3))
 
 
 class Scaled:
@@ -227,21 +189,15 @@ def test_similarity_is_a_cosine():
 
 
 BLIND = list(csv.DictReader((Path(__file__).parent / "blind_sentences.csv").read_text().splitlines()))
-NAMED = [entry for entry in BLIND if entry["hand"] != "none"]
 
 
 @pytest.mark.parametrize("encoder", [None, HashEncoder()], ids=["rules", "rules and similarity"])
-def test_nine_of_ten_blind_sentences_that_name_a_hand_are_read_right(encoder) -> None:
-    right = [entry for entry in NAMED if select_hand(entry["sentence"], encoder).hand == entry["hand"]]
-    assert len(NAMED) == 40
-    assert len(right) >= 0.9 * len(NAMED)
-
-
-@pytest.mark.parametrize("encoder", [None, HashEncoder()], ids=["rules", "rules and similarity"])
-def test_few_blind_sentences_are_read_wrong(encoder) -> None:
+def test_nine_of_ten_blind_sentences_that_name_a_hand_are_read_right_and_few_wrong(encoder) -> None:
     """Three of sixty, and of the 181 sentences of both lists 1.7 %: the hand that rests is taken for one that acts."""
     answers = [(entry["hand"], select_hand(entry["sentence"], encoder).hand) for entry in BLIND]
-    assert len(BLIND) == 60
+    named = [hand == answer for hand, answer in answers if hand != "none"]
+    assert (len(answers), len(named)) == (60, 40)
+    assert sum(named) >= 0.9 * len(named)
     assert sum(answer is not None and answer != hand for hand, answer in answers) <= 3
 
 

@@ -81,21 +81,11 @@ def test_the_references_forms_read_back_but_for_the_sizes_they_leave_out() -> No
         ("a b a b a", [(4, 0, 5)]),
     ],
 )
-def test_forms_are_matched_as_whole_words_like_a_search_for_each_form(text: str, expected) -> None:
+def test_forms_are_matched_as_whole_words(text: str, expected) -> None:
     forms = ["a train", "cup", "cup of tea", "(x)", "a b a"]
     lexicon = Lexicon([], [(form, form) for form in forms])
     matches = [(forms.index(match.base), match.start, match.stop) for match in lexicon._nouns.matches(text)]
     assert matches == expected
-    for number, form in enumerate(
-        forms
-    ):  # the plain way: every place of the form that no letter, digit or hyphen touches
-        places, start = [], 0
-        while (start := text.find(form, start)) >= 0:
-            stop = start + len(form)
-            joined = any(char.isalnum() or char in "_-" for char in (text[start - 1 : start] + text[stop : stop + 1]))
-            places += [] if joined else [(number, start, stop)]
-            start = start + 1 if joined else stop
-        assert places == [match for match in matches if match[0] == number]
 
 
 def test_a_form_that_stands_for_two_words_is_refused() -> None:
@@ -114,29 +104,25 @@ def test_a_form_that_stands_for_two_words_is_refused() -> None:
         ("Put on the glasses' lens with both hands.", "put on", "lens"),
         ("Put on eyeglasses.", "wear", "eyeglasses"),
         ("Wear eyeglasses.", "wear", "eyeglasses"),
+        ("Take out milk with both hands.", "take out", "milk"),
+        ("A camera is used to take a picture by the right hand.", "take a picture with", "camera"),
+        ("The left hand stamps a stamp.", "stamp", "stamp"),
+        ("A Stanford bunny is handed over by both hands.", "hand over", "Stanford bunny"),
+        ("Spraying spray with the right hand.", "spray", "spray"),
+        ("Lift a water bottle with your left hand.", "lift", "water bottle"),
+        ("Frobnicate the gizmo with both hands.", None, None),
+        ("Lift a mug with one hand.", "lift", "mug"),
+        ("Lift the mug with your hand.", "lift", "mug"),
+        ("Lift the mug by hand.", "lift", "mug"),
+        ("Lift the mug using one hand.", "lift", "mug"),
+        ("Using a single hand, lift the mug.", "lift", "mug"),
+        ("Lift a mug using only one hand.", "lift", "mug"),
+        ("Lift the hand with the right hand.", "lift", "hand"),
+        ("Lift a hand with the left hand.", "lift", "hand"),
+        ("Lift a hand.", "lift", "hand"),
+        ("Lift the hand with one hand.", "lift", "hand"),
     ],
 )
-def test_a_purpose_and_a_phrase_name_the_verb(text: str, verb: str, noun: str) -> None:
+def test_a_prompt_gives_back_its_verb_and_object(text: str, verb: str | None, noun: str | None) -> None:
     reading = read_prompt(text)
     assert (reading.verb, reading.object_words) == (verb, noun)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "Lift a mug with one hand.",
-        "Lift the mug with your hand.",
-        "Lift the mug by hand.",
-        "Lift the mug using one hand.",
-        "Using a single hand, lift the mug.",
-        "Lift a mug using only one hand.",
-    ],
-)
-def test_a_hand_of_no_side_is_neither_the_object_nor_a_verb(text: str) -> None:
-    reading = read_prompt(text)
-    assert (reading.verb, reading.object_words) == ("lift", "mug")
-
-
-@pytest.mark.parametrize("text", ["Lift the hand with the right hand.", "Lift a hand.", "Lift the hand with one hand."])
-def test_a_hand_that_is_lifted_is_the_object(text: str) -> None:
-    assert read_prompt(text).object_words == "hand"

@@ -154,7 +154,7 @@ def without_entry(entry: dict[str, str]) -> Grammar:
 
 @pytest.mark.parametrize("masked", [without_entry, lambda entry: Grammar({}, {})], ids=["entry", "whole table"])
 def test_with_its_rows_masked_the_rules_agree_with_nearly_the_whole_table(masked) -> None:
-    """At least 97 %; verbs miss "used to take a picture with", objects are taken for countable where English wavers."""
+    """Verbs miss "used to take a picture with", objects are taken for countable where English wavers."""
     verbs = {
         (entry["base"], name): getattr(masked(entry).verb(entry["base"]), name) == entry[name]
         for entry in table_rows("verb") for name in ("gerund", "past_participle", "third_singular")
@@ -163,12 +163,8 @@ def test_with_its_rows_masked_the_rules_agree_with_nearly_the_whole_table(masked
         entry["base"]: masked(entry).noun(entry["base"]).words == entry["words"] for entry in table_rows("object")
     }
     missed = [key for cells in (verbs, phrases) for key, right in cells.items() if not right]
-    print(f"verb cells {sum(verbs.values())} of {len(verbs)}, article cells {sum(phrases.values())} of {len(phrases)}")
-    assert (len(verbs), len(phrases)) == (3 * len(table_rows("verb")), len(table_rows("object")))
     assert len(verbs) > 300
     assert len(phrases) > 100
-    assert sum(verbs.values()) >= 0.97 * len(verbs)
-    assert sum(phrases.values()) >= 0.97 * len(phrases)
     assert missed == [("take a picture with", "past_participle"), "cappuccino", "espresso", "spray"]
 
 
