@@ -74,7 +74,6 @@ def annotate_store(
     settings: AnnotationSettings | None = None,
     *,
     contact: ContactSettings | None = None,
-    encoder: str | TextEncoder | None = None,
     hands: HandPair | None = None,
     excluded: Mapping[str, str] | None = None,
     **changes: Any,
@@ -90,7 +89,6 @@ def annotate_store(
         out_folder: folder to write.
         settings: settings of the stage.
         contact: settings of the stage contact, for the sampled points and the default threshold.
-        encoder: a text encoder or its name, instead of ``settings.encoder``.
         hands: as in ``open_store``.
         excluded: reasons of clips that get no sentence, by clip id.
         changes: fields that replace those of ``settings``.
@@ -99,10 +97,9 @@ def annotate_store(
     """
     settings, contact = replace(settings or AnnotationSettings(), **changes), contact or ContactSettings()
     threshold_m = contact.threshold_m if settings.threshold_m is None else settings.threshold_m
-    encoder = settings.encoder if encoder is None else encoder
-    encoder = load_encoder(encoder) if isinstance(encoder, str) else encoder
+    encoder = load_encoder(settings.encoder)
     store = open_store(clips_folder, hands)
-    annotated = _annotate_clips(store, threshold_m, contact.points, excluded or {}, _Writer(settings))
+    annotated = _annotate_clips(store, threshold_m, contact.points, excluded or {}, settings)
     sentences = list(dict.fromkeys(text for item in annotated for text in item.sentences or ()))
     counts = _counts(annotated, sentences)
     info = {"encoder": encoder.identity, "threshold_m": threshold_m, "points": contact.points}
@@ -116,44 +113,8 @@ def annotate_store(
     return counts
 
 
-@dataclass(frozen=True)
-class _Writer:
-    """Derives hand type, verb and sentences of a clip."""
-
-    settings: AnnotationSettings
-
-    def hand(self, clip: Clip, evidence: HandEvidence) -> _Hand:
-        """Return the labelled hand, if the settings prefer it and it is tracked, else the hands close to the object."""
-        labelled, close = clip.labelled_hand, evidence.hand_type
-        if close is None or labelled is None or self.settings.hand == "proximity":
-            return _Hand(close, close and "proximity")
-        tracked = all(clip.hands[side].valid.any() for side in SIDES if labelled in (side, "both"))
-        return _Hand(labelled, "annotated") if tracked else _Hand(close, "proximity")
-
-    def verb(self, clip: Clip, evidence: HandEvidence) -> _Verb:
-        """Return the verb of the source, else the verb derived from the motion, if enabled and a hand is active."""
-        if clip.verb is not None:
-            return _Verb(clip.verb, "source")
-        if not self.settings.derive_verbs or evidence.hand_type is None:
-            return _Verb(None, None)
-        derived = derive_verb(clip, evidence)
-        return _Verb(derived.verb, "derived", derived.evidence)
-
-    def sentences(
-        self, clip: Clip, hand: HandType | None, evidence: HandEvidence
-    ) -> tuple[tuple[str, ...] | None, str | None]:
-        """Return the sentences, or None and the reason."""
-        if hand is None:
-            return None, _no_hand(evidence)
-        write = english_sentences if self.settings.forms == "paper" else reference_sentences
-        try:
-            return write(clip.verb, clip.object_words, hand), None
-        except BadInput as error:
-            return None, str(error)
-
-
 def _annotate_clips(
-    store: Store, threshold_m: float, points: int, excluded: Mapping[str, str], writer: _Writer
+    store: Store, threshold_m: float, points: int, excluded: Mapping[str, str], settings: AnnotationSettings
 ) -> list[_Annotated]:
     indices = {name: ProximityIndex(cloud) for name, cloud in sample_objects(store, points).items()}
     annotated = []
@@ -161,11 +122,44 @@ def _annotate_clips(
         clip = store.clip(clip_id)
         joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
         evidence = find_active_hands(clip, joints, indices[clip.object.model.name], threshold_m)
-        hand, verb = writer.hand(clip, evidence), writer.verb(clip, evidence)
-        clip = replace(clip, verb=verb.base)
-        said = (None, excluded[clip_id]) if clip_id in excluded else writer.sentences(clip, hand.active, evidence)
-        annotated.append(_Annotated(clip_id, clip.labelled_hand, hand, evidence, *said, verb=verb))
+        hand, verb = _hand(clip, evidence, settings), _verb(clip, evidence, settings)
+        sentences, reason = None, excluded.get(clip_id)
+        if reason is None:
+            sentences, reason = _sentences(verb.base, clip.object_words, hand.active, evidence, settings)
+        annotated.append(_Annotated(clip_id, clip.labelled_hand, hand, evidence, sentences, reason, verb))
     return annotated
+
+
+def _hand(clip: Clip, evidence: HandEvidence, settings: AnnotationSettings) -> _Hand:
+    """Return the labelled hand, if the settings prefer it and it is tracked, else the hands close to the object."""
+    labelled, close = clip.labelled_hand, evidence.hand_type
+    if close is None or labelled is None or settings.hand == "proximity":
+        return _Hand(close, close and "proximity")
+    tracked = all(clip.hands[side].valid.any() for side in SIDES if labelled in (side, "both"))
+    return _Hand(labelled, "annotated") if tracked else _Hand(close, "proximity")
+
+
+def _verb(clip: Clip, evidence: HandEvidence, settings: AnnotationSettings) -> _Verb:
+    """Return the verb of the source, else the verb derived from the motion, if enabled and a hand is active."""
+    if clip.verb is not None:
+        return _Verb(clip.verb, "source")
+    if not settings.derive_verbs or evidence.hand_type is None:
+        return _Verb(None, None)
+    derived = derive_verb(clip, evidence)
+    return _Verb(derived.verb, "derived", derived.evidence)
+
+
+def _sentences(
+    verb: str | None, object_words: str, hand: HandType | None, evidence: HandEvidence, settings: AnnotationSettings
+) -> tuple[tuple[str, ...] | None, str | None]:
+    """Return the sentences, or None and the reason."""
+    if hand is None:
+        return None, _no_hand(evidence)
+    write = english_sentences if settings.forms == "paper" else reference_sentences
+    try:
+        return write(verb, object_words, hand), None
+    except BadInput as error:
+        return None, str(error)
 
 
 def _hand_row(item: _Annotated) -> dict:
