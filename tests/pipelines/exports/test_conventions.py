@@ -70,22 +70,6 @@ def rows_of(folder: Path) -> dict[str, dict[str, Any]]:
     }
 
 
-def feature_types(feature: Any) -> set[str]:
-    """All values of ``_type`` in the features of a schema."""
-    if not isinstance(feature, dict):
-        return set()
-    types = {feature["_type"]} if "_type" in feature else set()
-    return types.union(*map(feature_types, feature.values()))
-
-
-def test_the_features_are_those_that_datasets_3_supports(exported):
-    (path,) = exported["huggingface"].glob("data/*.parquet")
-    features = json.loads(pq.read_schema(path).metadata[b"huggingface"])["info"]["features"]
-    assert feature_types(features) == {"Value", "Sequence"}  # "List" came with datasets 4
-    assert features["left_joints_m"]["feature"]["length"] == 21
-    assert set(features) == set(pq.read_schema(path).names)
-
-
 def test_the_docs_name_the_tested_versions():
     page = (Path(__file__).parents[3] / "docs" / "export.md").read_text()
     tested = page.split("## Tested with")[1].split("## ")[0]
