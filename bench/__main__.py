@@ -8,13 +8,12 @@ Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder with the e
 
 import sys
 
-from bench import adapters, bimart, bimart_tables, kernels, paper_tables, recordings, samplers, scale, soak, speed
+from bench import adapters, bimart_tables, kernels, paper_tables, recordings, samplers, scale, soak, speed
 
 BENCHMARKS = {
     "adapters": adapters.main,
     "scale": scale.main,
     "kernels": kernels.main,
-    "bimart": bimart.main,
     "samplers": samplers.main,
     "bimart-tables": bimart_tables.main,
     "recordings": recordings.main,
