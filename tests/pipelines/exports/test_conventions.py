@@ -177,6 +177,7 @@ def test_lerobot_statistics_exclude_placeholders(store, exported):
         for key, reduce in (("mean", np.mean), ("std", np.std), ("min", np.min), ("max", np.max)):
             computed = np.concatenate([reduce(joints, axis=0) for joints in expected])
             assert statistics[name][key] == pytest.approx(computed, abs=1e-6), (name, key)
+    assert statistics["observation.state"]["count"] == [len(frames)]  # the right hand is tracked in all
     hinge = store.clip("toy/s2/open").object.hinge_rad
     assert hinge is not None
     assert statistics["observation.environment_state"]["mean"][7] == pytest.approx(hinge.mean())  # not of rigid objects
