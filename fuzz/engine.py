@@ -36,28 +36,13 @@ OPCODES = (
     *(b"K\x05", b"J\xff\xff\xff\xff", b"h\x00", b"q\x00", b"r\xff\xff\xff\x7f", b"U\x02O8", b"X\x02\0\0\0f8", b"I-1\n"),
 )
 WORDS = (
-    *(b"-1", b"255", b"65536", b"2147483648", b"9223372036854775807", b"18446744073709551616", b"1e308", b"1e999"),
-    *(b"-1e999", b"nan", b"NaN", b"inf", b"1_0", b"0x10", b"null", b"true", b"\\ud800", b"\xff", b"\0", b"\xd9\xa3"),
-    *(b"'descr': '|O'", b"(1000000000, 1000000000)", b"<f8", b"<U3", b"()", b"(-1,)", b".npy", b"PK\x01\x02"),
-    *(
-        b"1/2/3",
-        b"//",
-        b"\\\n",
-        b"element face 1000000000\n",
-        b"property list uchar int vertex_indices\n",
-        b"end_header\n",
-    ),
-    *(
-        b"[roots]\n",
-        b"'''",
-        b"[[a]]\n",
-        b"a.b.c = 1\n",
-        b"!!python/object/apply:os.system ",
-        b"&a ",
-        b"*a",
-        b"<<: *a\n",
-    ),
-)
+    b"-1", b"255", b"65536", b"2147483648", b"9223372036854775807", b"18446744073709551616", b"1e308", b"1e999",
+    b"-1e999", b"nan", b"NaN", b"inf", b"1_0", b"0x10", b"null", b"true", b"\\ud800", b"\xff", b"\0", b"\xd9\xa3",
+    b"'descr': '|O'", b"(1000000000, 1000000000)", b"<f8", b"<U3", b"()", b"(-1,)", b".npy", b"PK\x01\x02",
+    b"1/2/3", b"//", b"\\\n", b"element face 1000000000\n", b"property list uchar int vertex_indices\n",
+    b"end_header\n", b"[roots]\n", b"'''", b"[[a]]\n", b"a.b.c = 1\n", b"!!python/object/apply:os.system ",
+    b"&a ", b"*a", b"<<: *a\n",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -58,24 +58,10 @@ PHRASES = {
 # Names of variables and arguments that do not say what they hold.
 NAMES = frozenset(
     {
-        *(
-            "own",
-            "thing",
-            "things",
-            "found",
-            "known",
-            "told",
-            "every",
-            "kept",
-            "made",
-            "asked",
-            "wanted",
-            "beside",
-            "what",
-        ),
-        *("where", "there", "seen", "some", "given", "share", "way", "turn", "place", "held", "row"),
+        "own", "thing", "things", "found", "known", "told", "every", "kept", "made", "asked", "wanted", "beside",
+        "what", "where", "there", "seen", "some", "given", "share", "way", "turn", "place", "held", "row",
     }
-)
+)  # fmt: skip
 _PATTERNS = {phrase: re.compile(rf"\b(?:{phrase})\b", re.IGNORECASE) for phrase in PHRASES}
 _CODE_BLOCK = re.compile(r"```.*?```", re.DOTALL)
 
