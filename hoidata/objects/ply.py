@@ -145,61 +145,58 @@ def _read_rows(
     data: bytes, start: int, order: str, element: _Element, properties: list[int]
 ) -> tuple[list[_Column], int]:
     """Read some properties of an element, by index. Returns their columns and the offset of the next element."""
-    if element.count > MOST_TRIANGLES and any(item.count_kind for item in element.properties):
+    has_lists = any(item.count_kind for item in element.properties)
+    if has_lists and element.count > MOST_TRIANGLES:
         raise ValueError(f"more than {MOST_TRIANGLES} lists: decimate the mesh")
-    first = _locate_rows(data, start, order, element, min(1, element.count))
-    lengths = first.lengths[0].tolist() if element.count else [1] * len(element.properties)
-    equal = _equal_rows(data, start, order, element, lengths, properties)
+    equal = _equal_rows(data, start, order, element, properties)
     if equal is not None:
         return equal
-    rows = _locate_rows(data, start, order, element, element.count)
-    _check_counts(0, int(np.maximum(rows.lengths[:, properties] - 2, 0).sum()))
-    return [
-        _Column(rows.lengths[:, number], _gather(data, order + element.properties[number].kind, rows, number))
-        for number in properties
-    ], rows.end
+    if not has_lists:
+        raise ValueError(f"the file ends within its element {element.name[:40]!r}")
+    return _each_row(data, start, order, element, properties, element.count)
 
 
-class _Rows(NamedTuple):
-    """Locations of rows of varying length."""
-
-    begins: np.ndarray  # (row, property) offset of the first number
-    lengths: np.ndarray  # (row, property) count of numbers
-    end: int  # offset of the next element
-
-
-def _locate_rows(data: bytes, start: int, order: str, element: _Element, count: int) -> _Rows:
-    """Locate the first ``count`` rows of an element, one after the other: each row's length gives the next offset."""
+def _each_row(
+    data: bytes, start: int, order: str, element: _Element, properties: list[int], count: int
+) -> tuple[list[_Column], int]:
+    """The result of ``_read_rows`` for the first ``count`` rows, read one after the other."""
     readers = [
         (
             struct.Struct(order + _STRUCT_CODES[item.count_kind]) if item.count_kind else None,
+            _STRUCT_CODES[item.kind],
             np.dtype(item.kind).itemsize,
         )
         for item in element.properties
     ]
-    begins, lengths, offset = array("q"), array("q"), start
+    lengths, values = {number: array("q") for number in properties}, {number: array("d") for number in properties}
+    offset = start
     try:
         for _ in range(count):
-            for counter, size in readers:
+            for number, (counter, code, size) in enumerate(readers):
                 length = 1
                 if counter is not None:
                     length = _checked_length(counter.unpack_from(data, offset)[0])
                     offset += counter.size
-                begins.append(offset)
-                lengths.append(length)
+                if number in lengths:
+                    lengths[number].append(length)
+                    values[number].extend(struct.unpack_from(f"{order}{length}{code}", data, offset))
+                    if len(values[number]) > 3 * MOST_TRIANGLES:
+                        raise ValueError(f"more than {MOST_TRIANGLES} triangles: decimate the mesh")
                 offset += length * size
     except struct.error:
         offset = len(data) + 1
     if offset > len(data):
         raise ValueError(f"the file ends within its element {element.name[:40]!r}")
-    shape = count, len(readers)
-    return _Rows(np.array(begins, np.int64).reshape(shape), np.array(lengths, np.int64).reshape(shape), offset)
+    return [_Column(np.array(lengths[number], np.int64), np.array(values[number])) for number in properties], offset
 
 
 def _equal_rows(
-    data: bytes, start: int, order: str, element: _Element, lengths: list[int], properties: list[int]
+    data: bytes, start: int, order: str, element: _Element, properties: list[int]
 ) -> tuple[list[_Column], int] | None:
-    """The result of ``_read_rows`` if all rows have these lengths, else None. A fast path for triangle meshes."""
+    """The result of ``_read_rows`` if all rows are as long as the first, else None. Fast for triangle meshes."""
+    everything = list(range(len(element.properties)))
+    first = _each_row(data, start, order, element, everything, 1)[0] if element.count else []
+    lengths = [len(column.values) for column in first] or [1] * len(everything)
     fields: list[tuple] = []
     for number, (item, length) in enumerate(zip(element.properties, lengths, strict=True)):
         if item.count_kind is not None:
@@ -213,23 +210,9 @@ def _equal_rows(
     for number, length in enumerate(lengths):
         if element.properties[number].count_kind is not None and (table[f"length{number}"] != length).any():
             return None
-    _check_counts(0, sum(max(lengths[number] - 2, 0) * element.count for number in properties))
     return [
         _Column(np.full(element.count, lengths[number]), table[f"values{number}"].reshape(-1)) for number in properties
     ], end
-
-
-def _gather(data: bytes, kind: str, rows: _Rows, number: int) -> np.ndarray:
-    """(number,) values of one property in all rows."""
-    size, lengths = np.dtype(kind).itemsize, rows.lengths[:, number]
-    within = np.arange(lengths.sum()) - (np.cumsum(lengths) - lengths).repeat(lengths)
-    offsets = rows.begins[:, number].repeat(lengths) + within * size
-    values = np.empty(len(offsets), kind)
-    for shift in range(size):  # values are unaligned: read each from the view with its alignment
-        chosen = offsets % size == shift
-        if chosen.any():
-            values[chosen] = np.frombuffer(data, kind, (len(data) - shift) // size, shift)[offsets[chosen] // size]
-    return values
 
 
 def _checked_length(value: float) -> int:
@@ -271,6 +254,8 @@ def _fans(lists: _Column) -> np.ndarray:
     lengths = lists.lengths
     if lengths.min(initial=3) < 3:
         raise ValueError(f"a face of {lengths.min()} corners")
+    triangles = lengths - 2
+    _check_counts(0, int(triangles.sum()))
     with np.errstate(invalid="ignore"):
         corner_numbers = lists.values.astype(np.float64)
     if not (
@@ -280,7 +265,6 @@ def _fans(lists: _Column) -> np.ndarray:
     ):
         raise ValueError("a corner that is no whole number")
     corners = corner_numbers.astype(np.int64)
-    triangles = lengths - 2
     first = (np.cumsum(lengths) - lengths).repeat(triangles)
     second = first + 1 + np.arange(triangles.sum()) - (np.cumsum(triangles) - triangles).repeat(triangles)
     return np.stack((corners[first], corners[second], corners[second + 1]), axis=1)

@@ -119,6 +119,12 @@ def test_a_mesh_whose_polygons_change_at_every_row_is_read_in_less_than_a_second
     assert len(triangles) == (lengths - 2).sum()
 
 
+def test_an_element_of_more_rows_than_the_file_has_is_refused_immediately():
+    more = b"element more 99999999999\nproperty int a\nelement vertex"
+    with pytest.raises(ValueError, match="the file ends within its element 'more'"):
+        parse_ply(FILES["little"].replace(b"element vertex", more))
+
+
 def test_text_after_the_faces_is_ignored():
     data = FILES["text"].replace(b"end_header", b"element more 1\nproperty int a\nend_header") + b"no number"
     assert parse_ply(data)[1].tolist() == FANS
