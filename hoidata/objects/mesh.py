@@ -109,11 +109,11 @@ def _parse_named_obj(text: str, path: str | Path) -> tuple[Mesh, list[NamedPiece
     """
     vertices: list[list[float]] = []
     faces: list[tuple[int, int, int]] = []
-    divisions = {"o": _FaceNames("objects"), "g": _FaceNames("groups")}
+    names = {"o": _FaceNames(), "g": _FaceNames()}
     for number, line in _joined_lines(text):
         words = line.split(maxsplit=MOST_CORNERS + 1)
-        if words and words[0] in divisions:
-            divisions[words[0]].begin(line, len(faces))
+        if words and words[0] in names:
+            names[words[0]].begin(line, len(faces))
         if not words or words[0] not in ("v", "f"):
             continue
         if len(words) > MOST_CORNERS + 1 or len(vertices) > MOST_VERTICES or len(faces) > MOST_TRIANGLES:
@@ -131,37 +131,28 @@ def _parse_named_obj(text: str, path: str | Path) -> tuple[Mesh, list[NamedPiece
             raise BadInput(f"{path}:{number}", expected, repr(line[:60].strip()), "export the mesh again")
         faces.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
     mesh = Mesh(np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64).reshape(-1, 3))
-    return mesh, [names.pieces(len(faces)) for names in divisions.values()]
+    return mesh, [names["o"].pieces("objects", len(faces)), names["g"].pieces("groups", len(faces))]
 
 
 class _FaceNames:
     """Collects the names of objects or of groups, and the face at which each name begins."""
 
-    def __init__(self, kind: str) -> None:
-        self.kind = kind
-        self.name, self.first_face = "", 0  # of the piece being read
-        self.piece_of_name: dict[str, int] = {}
-        self.first_faces, self.pieces_in_order = array("q"), array("q")
+    def __init__(self) -> None:
+        self.piece_of_name = {"": 0}
+        self.first_faces, self.pieces_in_order = array("q", [0]), array("q", [0])
 
     def begin(self, line: str, face: int) -> None:
         """Start the piece that a line such as "o lid" names, with the face of this number."""
-        self._end(face)
-        self.name = " ".join(line.split()[1:])[:60] if len(line) < 1000 else line[1:61].strip()
-        self.first_face = face
+        name = " ".join(line.split()[1:])[:60] if len(line) < 1000 else line[1:61].strip()
+        if name not in self.piece_of_name and len(self.piece_of_name) < _MOST_NAMES:
+            self.piece_of_name[name] = len(self.piece_of_name)
+        self.first_faces.append(face)
+        self.pieces_in_order.append(self.piece_of_name.get(name, _MOST_NAMES))
 
-    def _end(self, face: int) -> None:
-        if face == self.first_face:  # ignore a name without faces
-            return
-        if self.name not in self.piece_of_name and len(self.piece_of_name) < _MOST_NAMES:
-            self.piece_of_name[self.name] = len(self.piece_of_name)
-        self.first_faces.append(self.first_face)
-        self.pieces_in_order.append(self.piece_of_name.get(self.name, _MOST_NAMES))
-
-    def pieces(self, n_faces: int) -> NamedPieces:
+    def pieces(self, kind: str, n_faces: int) -> NamedPieces:
         """The pieces of a file with this many faces."""
-        self._end(n_faces)
         counts = np.diff(np.append(np.array(self.first_faces, np.int64), n_faces))
-        return NamedPieces(self.kind, list(self.piece_of_name), np.array(self.pieces_in_order, np.int64).repeat(counts))
+        return NamedPieces(kind, list(self.piece_of_name), np.array(self.pieces_in_order, np.int64).repeat(counts))
 
 
 def _joined_lines(text: str) -> Iterator[tuple[int, str]]:
