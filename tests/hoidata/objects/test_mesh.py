@@ -102,49 +102,6 @@ def test_an_stl_has_one_vertex_per_corner_of_the_solid(tmp_path: Path, kind: str
     assert mass_properties(*read).volume_m3 == pytest.approx(8)
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
-def test_a_ply_keeps_vertex_order(tmp_path: Path, encoding):
-    vertices = np.array([[0, 0, 1], [0, 0, 0], [1, 0, 0], [0, 0, 0], [0, 1, 0]], dtype=float)
-    mesh = trimesh.Trimesh(vertices, [[0, 1, 2], [3, 4, 0]], process=False)
-    (tmp_path / "a.ply").write_bytes(mesh.export(file_type="ply", encoding=encoding.partition("_")[0]))
-    read = load_mesh(tmp_path / "a.ply")
-    np.testing.assert_array_equal(read.vertices, vertices)
-    assert read.faces.tolist() == [[0, 1, 2], [3, 4, 0]]
-
-
-PLY_WITH_TEXTURE = """ply
-format ascii 1.0
-element vertex 4
-property float x
-property float y
-property float z
-property float s
-property float t
-element face 2
-property list uchar int vertex_indices
-{per_face}end_header
-0 0 1 0.9 0.1
-0 0 0 0.2 0.3
-1 0 0 0.5 0.5
-0 1 0 0.1 0.8
-3 3 1 2{first}
-3 1 0 2{second}
-"""
-TEXTURES = {
-    "per vertex": ("", "", ""),
-    "per corner": ("property list uchar float texcoord\n", " 6 .1 .1 .2 .2 .3 .3", " 6 .7 .7 .8 .8 .3 .3"),
-}
-
-
-@pytest.mark.parametrize("kind", TEXTURES)
-def test_texture_coordinates_neither_split_nor_reorder_the_vertices_of_a_ply(tmp_path: Path, kind):
-    per_face, first, second = TEXTURES[kind]
-    (tmp_path / "a.ply").write_text(PLY_WITH_TEXTURE.format(per_face=per_face, first=first, second=second))
-    mesh = load_mesh(tmp_path / "a.ply")
-    assert mesh.vertices.tolist() == [[0, 0, 1], [0, 0, 0], [1, 0, 0], [0, 1, 0]]
-    assert mesh.faces.tolist() == [[3, 1, 2], [1, 0, 2]]
-
-
 BAD = {
     "zero.obj": ("v 0 0 0\nv 1 0 0\nf 0 1 2\nv 0 1 0\n", "numbers"),
     "empty.obj": ("", "vertices"),
