@@ -11,21 +11,10 @@ from hoidata.contact.proximity import ENTRY, ProximityIndex, near_entries, point
 from hoidata.errors import BadInput
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.objects.sampling import SampledPoints
+from tests.builders.objects import sampled
 
 FRAMES, JOINTS = 9, 21
 Scene = tuple[SampledPoints, ObjectTrack, np.ndarray]
-
-
-def sampled(points_m: np.ndarray, part: np.ndarray) -> SampledPoints:
-    nothing = np.zeros((len(points_m), 3), np.float32)
-    return SampledPoints(
-        points_m=points_m.astype(np.float32),
-        normals=nothing,
-        face=np.zeros(len(part)),
-        barycentric=nothing,
-        part=part,
-        method="surface-fps",
-    )
 
 
 def scene(seed: int, n_points: int, articulated: bool, spread_m: float) -> Scene:
