@@ -146,8 +146,7 @@ class Run:
             self._train(network, networks, method.preset)
         options = {"samples": method.samples or self.samples, "seed": self.seed, "clips": self.clips}
         options |= {"windows": asdict(self.windows)} if self.windows else {}
-        settings, progress = {"bimart": {**self.settings, **method.settings}}, folder.with_name(f"{name}-progress")
-        is_continued, start_s = progress.is_dir(), time.process_time()
+        settings, start_s = {"bimart": {**self.settings, **method.settings}}, time.process_time()
         counts = sample_family(
             family,
             self.data,
@@ -157,7 +156,6 @@ class Run:
             self.hands,
             settings=settings,
             device=self.device,
-            progress=progress,
         )
         if not counts["clips"]:
             return read_json(folder / "empty.json")
@@ -166,7 +164,7 @@ class Run:
         metrics = tuple(metric for metric in select_metrics(["bimart"]) if metric.name in shown)
         result = evaluate_store(folder / "clips", self.data, self.hands, metrics=metrics)
         seconds = sampled_s - start_s, time.process_time() - sampled_s
-        result["seconds"] = [None if is_continued else seconds[0] / result["motions"], seconds[1] / result["motions"]]
+        result["seconds"] = [part / result["motions"] for part in seconds]
         write_whole(path, canonical_json(result))
         return result
 

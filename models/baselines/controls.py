@@ -5,6 +5,7 @@ A metric that is as good on a control as on the recorded clips is blind to the p
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -45,7 +46,8 @@ class PerturbedRecording:
             key = self._key(request)
             if key not in perturbed:
                 perturbed[key] = self.perturb(self.truth.recorded(request), Recording(self.truth.annotated, request))
-        return [_answer(request, perturbed[self._key(request)]) for request in requests]
+        answers = [(request.motion_id, perturbed[self._key(request)]) for request in requests]
+        return [Skipped(name, one) if isinstance(one, str) else replace(one, clip_id=name) for name, one in answers]
 
     def sample_with_targets(self, requests: Sequence[Request]) -> tuple[list[Clip | Skipped], list[np.ndarray]]:
         return self.sample(requests), self.truth.contact_maps(requests)
@@ -75,16 +77,6 @@ class Recording:
         frames = np.unique(self.annotated.distances(self.request.clip_id, side).frame)
         return frames[frames < self.request.n_frames]
 
-    def joints_in_object(self, clip: Clip, side: Side, frames: np.ndarray) -> np.ndarray:
-        """(chosen frame, 21, 3) joints in the object frame, metres."""
-        joints_m = self.annotated.joints(self.request.clip_id, side)[frames]
-        return clip.object.take(frames).world_from_object.inverse() @ joints_m
-
-
-def _answer(request: Request, perturbed: Clip | str) -> Clip | Skipped:
-    motion_id = request.motion_id
-    return Skipped(motion_id, perturbed) if isinstance(perturbed, str) else replace(perturbed, clip_id=motion_id)
-
 
 def static(clip: Clip, recording: Recording) -> Clip | str:
     """Repeat the frame of the first contact."""
@@ -111,13 +103,8 @@ def hands_away(clip: Clip, recording: Recording) -> Clip | str:
 
 
 def pressed(clip: Clip, recording: Recording, by_m: float = PRESSED_M) -> Clip | str:
-    """Move each hand 1 cm into the object, against the normal at the point closest to a joint."""
+    """Move each hand into the object, against the normal at the point closest to a joint."""
     return _with_hands(clip, {side: _pressed_in(clip, recording, side, by_m) for side in recording.sides})
-
-
-def pressed_deep(clip: Clip, recording: Recording) -> Clip | str:
-    """Move each hand 3 cm into the object."""
-    return pressed(clip, recording, PRESSED_DEEP_M)
 
 
 def hands_still(clip: Clip, recording: Recording) -> Clip | str:
@@ -193,7 +180,8 @@ def _moved_off(clip: Clip, recording: Recording, side: Side) -> HandTrack | None
     frames = touching[np.linspace(0, len(touching) - 1, min(MOST_FRAMES_MEASURED, len(touching))).astype(int)]
     points, track = recording.request.points, clip.object.take(frames)
     points_m = articulate(points.points_m.astype(np.float64), points.part, track.model.hinge, track.hinge_rad)
-    joints_from_points = recording.joints_in_object(clip, side, frames)[:, :, None] - points_m[:, None]
+    joints_m = track.world_from_object.inverse() @ recording.annotated.joints(recording.request.clip_id, side)[frames]
+    joints_from_points = joints_m[:, :, None] - points_m[:, None]
     shift = _shortest_clearing_move(joints_from_points.reshape(-1, 3), HANDS_AWAY_M)
     return _shifted(clip.hands[side], clip.object.world_from_object.rotation @ shift)
 
@@ -238,7 +226,7 @@ REVERSED = _control("reversed", "recorded, backwards", backwards)
 OBJECT_MOVED = _control("object-moved", "recorded, object 10 cm away", object_moved, differs_per_motion=True)
 HANDS_AWAY = _control("hands-away", "recorded, hands 2 cm off the surface", hands_away)
 PRESSED = _control("pressed", "recorded, hands 1 cm inside", pressed)
-PRESSED_DEEP = _control("pressed-deep", "recorded, hands 3 cm inside", pressed_deep)
+PRESSED_DEEP = _control("pressed-deep", "recorded, hands 3 cm inside", partial(pressed, by_m=PRESSED_DEEP_M))
 HANDS_STILL = _control("hands-still", "recorded, hands frozen", hands_still)
 HANDS_SHIFTED = _control("hands-shifted", "recorded, hands 3 cm to one side", hands_shifted, differs_per_motion=True)
 NOISE = _control("noise", "recorded, with 5 mm of noise", noisy, differs_per_motion=True)

@@ -11,7 +11,7 @@ from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from hoidata.store.annotated import AnnotatedStore
-from models.baselines.retrieval import matched_rows, train_clips
+from models.baselines.retrieval import matched_rows
 from models.common.family import Family, SingleRequestSampler, Skipped, motion_clip
 from models.common.features import proper_hands, proper_object
 
@@ -98,5 +98,5 @@ def _means(total: np.ndarray, count: np.ndarray) -> np.ndarray:
 
 
 GROUND_TRUTH = Family("ground-truth", "ground truth", lambda sources: GroundTruth(sources.annotated))
-MEAN_POSE = Family("mean-pose", "mean pose", lambda sources: MeanMotion.of(train_clips(sources), 1))
-MEAN_MOTION = Family("mean-motion", "mean motion", lambda sources: MeanMotion.of(train_clips(sources), TIME_BINS))
+MEAN_POSE = Family("mean-pose", "mean pose", lambda sources: MeanMotion.of(sources.clips("train"), 1))
+MEAN_MOTION = Family("mean-motion", "mean motion", lambda sources: MeanMotion.of(sources.clips("train"), TIME_BINS))

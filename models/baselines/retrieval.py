@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from hoidata.batches.dataset import ClipSample, HoiDataset
+from hoidata.batches.dataset import ClipSample
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.store.annotated import AnnotatedStore
@@ -109,14 +109,9 @@ def matched_rows(n_frames: int, length: int) -> np.ndarray:
     return np.arange(n_frames) * length // max(n_frames, 1)
 
 
-def train_clips(sources: Sources) -> list[ClipSample]:
-    """The training clips, cropped at the start."""
-    return list(HoiDataset(sources.annotated, "train", crop="start"))
-
-
 def retrieval_clips(sources: Sources) -> list[ClipSample]:
     """The training clips with all hands tracked: values of an untracked hand are not a motion."""
-    return [sample for sample in train_clips(sources) if sample.is_tracked]
+    return [sample for sample in sources.clips("train") if sample.is_tracked]
 
 
 def _family(name: str, title: str, load: Callable[[Train, Prompt], Retrieval]) -> Family:

@@ -226,7 +226,7 @@ def diagnose(sources: Sources) -> Figures:
     """
     model = BimArtSampler.load(sources).model
     features = model.motion.config.features
-    test_clips = list(HoiDataset(sources.annotated, "test", crop="start"))
+    test_clips = sources.clips("test")
     chosen = test_clips[:: -(-len(test_clips) // DIAGNOSED_CLIPS)]
     means = mean_maps(training_clips(sources.annotated), sources.hands, features)
     errors = [_errors_mm(model, sample, recorded_clip(sample, sources.hands, features), means) for sample in chosen]

@@ -6,7 +6,6 @@ motions = hands_for(sampler, path.track, HandSamplingOptions(seed=1, samples=2))
 """
 
 from dataclasses import dataclass, field, replace
-from hashlib import sha256
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -22,6 +21,7 @@ from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.part_bps import distance_map
 from models.bimart.family import BimArtSampler
 from models.bimart.sampler import SampledMotion
+from models.common.repeatable import seed_of
 
 MIN_FRAMES = 8
 TOUCH_M = 0.005
@@ -98,7 +98,6 @@ def contact_measures(clip: Clip, sampler: BimArtSampler) -> ContactMeasures:
 
 
 def _request(object_track: ObjectTrack, options: HandSamplingOptions, points: SampledPoints, number: int) -> Request:
-    seed_text = f"{options.seed} {number} {object_track.model.name}"
     model_from_world, origin = upright(options.gravity), np.asarray(object_track.translation_m[0], np.float64)
     world_from_model = np.eye(4)
     world_from_model[:3, :3], world_from_model[:3, 3] = model_from_world.T, origin
@@ -110,7 +109,7 @@ def _request(object_track: ObjectTrack, options: HandSamplingOptions, points: Sa
         text=np.zeros(512, np.float32),
         active_hands=np.array([options.hand in (side, "both") for side in SIDES]),
         n_frames=object_track.n_frames,
-        seed=int.from_bytes(sha256(seed_text.encode()).digest()[:7]),
+        seed=seed_of(f"{options.seed} {number} {object_track.model.name}"),
         number=number,
         object_words=options.words or object_track.model.name,
         betas=options.betas,

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hoidata.batches.dataset import ClipBatch, collate
+from hoidata.batches.dataset import ClipBatch, ClipSample, HoiDataset, collate
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack
 from hoidata.clips.features import N_ROTATIONS, OBJECT_HINGE, OBJECT_POSITION, WRIST
@@ -109,6 +109,10 @@ class Sources:
     device: torch.device
     settings: Mapping[str, Any] = field(default_factory=dict)  # section of params.yaml by family
     encoder: str = ""  # name of the text encoder (``load_encoder``); "": the one that the annotation names
+
+    def clips(self, split: str) -> list[ClipSample]:
+        """The clips of a split; of a clip that is too long, the first frames."""
+        return list(HoiDataset(self.annotated, split, crop="start"))
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ Feature layout: ``hoidata.clips.features``. Axes (batch, side, frame, ...); side
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -163,27 +163,26 @@ class Hands(nn.Module):
 
     def joints(self, hands: Tensor, betas: Tensor, template_m: Tensor | None = None) -> Tensor:
         """Joints (B, 2, F, 21, 3), metres, of features (B, 2, F, 99); betas (B, 2, 10), template (B, 2, 778, 3)."""
-        sides = [self._arguments(hands, betas, template_m, side) for side in range(2)]
-        joints = [layer.joints(*arguments) for layer, arguments in zip(self._layers(), sides, strict=True)]
+        joints = [layer.joints(*arguments) for layer, arguments in self._sides(hands, betas, template_m)]
         return torch.stack([side.reshape(len(hands), hands.shape[2], 21, 3) for side in joints], 1)
 
     def vertices(self, hands: Tensor, betas: Tensor, template_m: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Vertices (B, 2, F, 778, 3) and joints (B, 2, F, 21, 3), metres; arguments as in ``joints``."""
-        sides = [self._arguments(hands, betas, template_m, side) for side in range(2)]
-        both = [layer(*arguments) for layer, arguments in zip(self._layers(), sides, strict=True)]
+        both = [layer(*arguments) for layer, arguments in self._sides(hands, betas, template_m)]
         shape = (len(hands), hands.shape[2], -1, 3)
         vertices, joints = zip(*[(mesh.reshape(shape), joint.reshape(shape)) for mesh, joint in both], strict=True)
         return torch.stack(vertices, 1), torch.stack(joints, 1)
 
-    def _layers(self) -> list[HandKinematics]:
-        return [layer for layer in self.kinematics if isinstance(layer, HandKinematics)]
-
-    def _arguments(self, hands: Tensor, betas: Tensor, template_m: Tensor | None, side: int) -> tuple:
-        flat = hands[:, side].reshape(-1, HAND_FEATURES)
-        n_frames = hands.shape[2]
-        frame_betas = betas[:, side].repeat_interleave(n_frames, 0)
-        template = None if template_m is None else template_m[:, side].repeat_interleave(n_frames, 0)
-        return flat[..., WRIST], hand_rotmats(flat), frame_betas, template
+    def _sides(
+        self, hands: Tensor, betas: Tensor, template_m: Tensor | None
+    ) -> Iterator[tuple[HandKinematics, tuple[Tensor, Tensor, Tensor, Tensor | None]]]:
+        """The layer of each side with its arguments, all frames of all clips at once."""
+        for side, layer in enumerate(self.kinematics):
+            assert isinstance(layer, HandKinematics)
+            flat, n_frames = hands[:, side].reshape(-1, HAND_FEATURES), hands.shape[2]
+            frame_betas = betas[:, side].repeat_interleave(n_frames, 0)
+            template = None if template_m is None else template_m[:, side].repeat_interleave(n_frames, 0)
+            yield layer, (flat[..., WRIST], hand_rotmats(flat), frame_betas, template)
 
 
 @dataclass(frozen=True)
@@ -233,7 +232,7 @@ class Normaliser:
 
     def tensors(self) -> dict[str, Tensor]:
         """The four tensors with their field names, to store in a checkpoint."""
-        return {name: getattr(self, name) for name in ("hand_mean", "hand_scale", "object_mean", "object_scale")}
+        return dict(vars(self))
 
 
 def _moments(frames: list[Tensor], size: int) -> tuple[np.ndarray, np.ndarray]:

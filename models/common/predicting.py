@@ -1,10 +1,8 @@
 """Samples a family's motions for a dataset's test clips, and writes them as a store of clips."""
 
 import json
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from hashlib import sha256
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,26 +16,20 @@ from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request, Sentence, Trajectories
 from hoidata.clips.clip import Clip
 from hoidata.clips.features import GLOBAL_ORIENT_6D
-from hoidata.files import atomic_folder, sha256_file, write_whole
-from hoidata.files.atomic import canonical_json
-from hoidata.files.written import read_json_rows
+from hoidata.files import atomic_folder, write_whole
 from hoidata.hands import HandPair
-from hoidata.metrics.target_contact import (
-    TargetDistances,
-    read_target_contact,
-    read_target_distances,
-    write_target_contact,
-    write_target_distances,
-)
+from hoidata.metrics.target_contact import TargetDistances, write_target_contact, write_target_distances
 from hoidata.settings import build_config, require_at_least
 from hoidata.store.annotated import WindowedStore, WindowProtocol, load_annotated
-from hoidata.store.store import open_store, write_store
+from hoidata.store.store import write_store
 from models.common.checkpoints import FILE_NAME, empty_reason, write_empty
 from models.common.family import Family, ReportsContact, Sampler, Skipped, Sources
+from models.common.repeatable import seed_of
 
 CLIPS_AT_ONCE = 32
 LEFT_OUT = "left_out.json"
 Item = TypeVar("Item")
+Contact = np.ndarray | TargetDistances  # that a motion is conditioned on
 
 
 @dataclass(frozen=True)
@@ -65,7 +57,6 @@ def sample_family(
     settings: Mapping[str, Any] | None = None,
     encoder: str = "",
     device: str = "cpu",
-    progress: Path | None = None,
 ) -> dict[str, int]:
     """Sample a family's motions for the test clips.
 
@@ -80,8 +71,6 @@ def sample_family(
         checkpoints: folder with one checkpoint folder per network.
         settings: section of params.yaml by family.
         encoder: name of the text encoder, for families that read sentences; "": the one that the annotation names.
-        progress: a folder for finished motions, from which an interrupted call continues with the same bytes; it is
-            removed at the end. Delete it after a change of code or data.
 
     Returns counts of the store.
     """
@@ -102,9 +91,8 @@ def sample_family(
         info = annotated.info | {"family": family.name, "sampling_device": sources.device.type}
         info |= {"length": "own"} if family.estimates_length else {}
         info |= {"windows": asdict(config.windows)} if config.windows else {}
-        left_out, contacts = list[Skipped](), dict[str, np.ndarray | TargetDistances]()
-        parts = _Parts.of(progress, family, sources, config, info) if progress else None
-        motions = _motions_of(_motions(family.load(sources), test, config, contacts, parts), left_out)
+        left_out, contacts = list[Skipped](), dict[str, Contact]()
+        motions = _motions(family.load(sources), test, config, left_out, contacts)
         first = next(motions, None)
         if first is None:
             write_empty(partial, f"no motion of {len(left_out)}: {left_out[0].reason}")
@@ -114,8 +102,6 @@ def sample_family(
         _write(partial / "diagnostics.json", family.diagnose(sources))
         if left_out:
             _write(partial / LEFT_OUT, [asdict(item) for item in left_out])
-    if progress:
-        shutil.rmtree(progress, ignore_errors=True)
     return counts
 
 
@@ -136,7 +122,7 @@ def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
             text=sample.text[0],
             active_hands=sample.active_hands,
             n_frames=sample.length,
-            seed=int.from_bytes(sha256(f"{config.seed} {number} {sample.clip_id}".encode()).digest()[:7]),
+            seed=seed_of(f"{config.seed} {number} {sample.clip_id}"),
             number=number,
             clip_id=sample.clip_id,
             object_words=sample.object_words,
@@ -156,7 +142,7 @@ def first_sentence(sample: ClipSample) -> Sentence:
     return Sentence(sample.sentences[0], sample.verb, sample.object_words or None)
 
 
-def _write_asked(folder: Path, contacts: Mapping[str, np.ndarray | TargetDistances]) -> None:
+def _write_asked(folder: Path, contacts: Mapping[str, Contact]) -> None:
     """Write the contact conditions, each kind to its file, if there are any."""
     distances = {name: contact for name, contact in contacts.items() if isinstance(contact, TargetDistances)}
     if touched := {name: contact for name, contact in contacts.items() if isinstance(contact, np.ndarray)}:
@@ -169,81 +155,26 @@ def _write(path: Path, values: Any) -> None:
     write_whole(path, json.dumps(values, indent=2, sort_keys=True) + "\n")
 
 
-def _motions_of(answers: Iterator[Clip | Skipped], left_out: list[Skipped]) -> Iterator[Clip]:
-    """The motions among the answers; skipped requests are appended to ``left_out``."""
-    for answer in answers:
-        if isinstance(answer, Skipped):
-            left_out.append(answer)
-        else:
-            yield answer
-
-
 def _motions(
     sampler: Sampler,
     test: Sequence[ClipSample],
     config: PredictionConfig,
-    contacts: dict[str, np.ndarray | TargetDistances],
-    parts: "_Parts | None",
-) -> Iterator[Clip | Skipped]:
-    """The answers in order; adds each motion's contact condition, if the family reports it, to ``contacts``."""
+    left_out: list[Skipped],
+    contacts: dict[str, Contact],
+) -> Iterator[Clip]:
+    """The motions in order; adds skipped requests to ``left_out``, and reported contact conditions to ``contacts``."""
     starts = range(0, len(test), CLIPS_AT_ONCE)
     for start in track(starts, description="sampling", transient=True, console=Console(stderr=True)):
         chosen = test[start : start + CLIPS_AT_ONCE]
         requests = [request for sample in chosen for request in requests_for(sample, config)]
-        answers, maps = parts.answers(start, sampler, requests) if parts else _answers(sampler, requests)
-        contacts |= maps
-        yield from answers
-
-
-def _answers(
-    sampler: Sampler, requests: Sequence[Request]
-) -> tuple[Sequence[Clip | Skipped], dict[str, np.ndarray | TargetDistances]]:
-    """The answers in order, and contact conditions by id of the motion."""
-    if not isinstance(sampler, ReportsContact):
-        return sampler.sample(requests), {}
-    answers, maps = sampler.sample_with_targets(requests)
-    return answers, {
-        answer.clip_id: contact for answer, contact in zip(answers, maps, strict=True) if contact is not None
-    }
-
-
-@dataclass(frozen=True)
-class _Parts:
-    """Finished answers in a folder: one store of clips per batch of requests."""
-
-    folder: Path
-    info: dict[str, Any]  # of the stores
-    hands: HandPair
-
-    @classmethod
-    def of(
-        cls, root: Path, family: Family, sources: Sources, config: PredictionConfig, info: dict[str, Any]
-    ) -> "_Parts":
-        """The parts of one request; another family, network, setting or dataset has another folder."""
-        networks = [sha256_file(sources.checkpoints / name / FILE_NAME) for name in family.uses]
-        facts = [family.name, asdict(config), dict(sources.settings), sources.encoder, networks, info]
-        return cls(root / sha256(canonical_json(facts).encode()).hexdigest()[:16], info, sources.hands)
-
-    def answers(
-        self, number: int, sampler: Sampler, requests: Sequence[Request]
-    ) -> tuple[list[Clip | Skipped], dict[str, np.ndarray | TargetDistances]]:
-        """As ``_answers``; sampled only if this part is not in the folder yet."""
-        folder = self.folder / f"{number:05d}"
-        if not (folder / LEFT_OUT).is_file():
-            answers, maps = _answers(sampler, requests)
-            left_out = [asdict(answer) for answer in answers if isinstance(answer, Skipped)]
-            with atomic_folder(folder) as partial:
-                write_store(
-                    partial / "clips", [answer for answer in answers if not isinstance(answer, Skipped)], self.info
-                )
-                _write_asked(partial, maps)
-                _write(partial / LEFT_OUT, left_out)
-        store = open_store(folder / "clips", self.hands)
-        skipped = read_json_rows(folder / LEFT_OUT, {"clip_id": str, "reason": str})
-        reasons = {item["clip_id"]: item["reason"] for item in skipped}
-        maps = read_target_contact(store.folder) | read_target_distances(store.folder)
-        ids = [request.motion_id for request in requests]
-        return [Skipped(name, reasons[name]) if name in reasons else store.clip(name) for name in ids], maps
+        if isinstance(sampler, ReportsContact):
+            answers, maps = sampler.sample_with_targets(requests)
+            pairs = zip(answers, maps, strict=True)
+            contacts |= {answer.clip_id: contact for answer, contact in pairs if contact is not None}
+        else:
+            answers = sampler.sample(requests)
+        left_out += [answer for answer in answers if isinstance(answer, Skipped)]
+        yield from (answer for answer in answers if isinstance(answer, Clip))
 
 
 def _why_not(family: Family, root: Path, checkpoints: Path) -> str | None:

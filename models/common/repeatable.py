@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from hashlib import sha256
 
 import numpy as np
 import torch
@@ -38,6 +39,11 @@ def seeded_generator(*words: int) -> torch.Generator:
     seed = int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> np.uint64(1))
     torch.manual_seed(seed)
     return torch.Generator().manual_seed(seed)
+
+
+def seed_of(text: str) -> int:
+    """A seed that depends on a text only."""
+    return int.from_bytes(sha256(text.encode(errors="backslashreplace")).digest()[:7])
 
 
 DEVICES = ("auto", "cpu", "cuda")

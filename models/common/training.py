@@ -99,14 +99,13 @@ class TrainingSpec:
         """
         section = f"params.yaml: {network.name}"
         check_keys(params, ("network", "training", "loss", "seed"), section)
-        network_key, training_key, loss_key = (
-            key_in_file(params, name, section) for name in ("network", "training", "loss")
-        )
+
+        def built(config: type, name: str) -> Any:
+            return build_config(config, params.get(name), key_in_file(params, name, section))
+
+        loss = built(network.loss, "loss") if network.loss else None
         return cls(
-            build_config(network.config, params.get("network"), network_key),
-            build_config(TrainingConfig, params.get("training"), training_key),
-            build_config(network.loss, params.get("loss"), loss_key) if network.loss else None,
-            int(params.get("seed", 0)),
+            built(network.config, "network"), built(TrainingConfig, "training"), loss, int(params.get("seed", 0))
         )
 
 

@@ -6,6 +6,7 @@ instead; ``imos-true-start`` sees the recorded ones, which other methods do not.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from hoidata.batches.requests import Request, RequestBatch
 from hoidata.clips.features import HAND_FEATURES, HAND_ROTATIONS_6D, OBJECT_ROTATION_6D
 from hoidata.devices import send
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
-from models.baselines.retrieval import by_sentence, retrieval_clips, train_clips
+from models.baselines.retrieval import by_sentence, retrieval_clips
 from models.common.checkpoints import load_checkpoint
 from models.common.corpus import any_form
 from models.common.family import Family, Losses, Sources
@@ -134,17 +135,12 @@ def _first_keys(sample: ClipSample) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(sample.hands[:, rows]), torch.from_numpy(sample.object[rows])
 
 
-@dataclass(frozen=True)
-class RetrievedStart:
+def _retrieved_start(train: Sequence[ClipSample], request: Request) -> ClipSample:
     """The training clip with the verb, the hands and the most similar sentence of a request."""
-
-    train: Sequence[ClipSample]
-
-    def __call__(self, request: Request) -> ClipSample:
-        ranked = [self.train[index] for index in by_sentence(self.train, request)]
-        verb = request.sentence.verb if request.sentence else None
-        same = [one for one in ranked if one.verb == verb and np.array_equal(one.active_hands, request.active_hands)]
-        return [*same, *ranked][0]
+    ranked = [train[index] for index in by_sentence(train, request)]
+    verb = request.sentence.verb if request.sentence else None
+    same = [one for one in ranked if one.verb == verb and np.array_equal(one.active_hands, request.active_hands)]
+    return [*same, *ranked][0]
 
 
 def _true_start(sources: Sources, request: Request) -> ClipSample:
@@ -160,13 +156,13 @@ IMOS = vector_network("imos", ImosConfig, ImosNetwork, ImosObjective)
 FAMILY = Family(
     "imos",
     "IMoS, starts from a retrieved clip",
-    lambda sources: _load(sources, RetrievedStart(retrieval_clips(sources) or train_clips(sources))),
+    lambda sources: _load(sources, partial(_retrieved_start, retrieval_clips(sources) or sources.clips("train"))),
     networks=(IMOS,),
     uses=(IMOS.name,),
 )
 TRUE_START = Family(
     "imos-true-start",
     "IMoS, sees 4 true frames",
-    lambda sources: _load(sources, lambda request: _true_start(sources, request)),
+    lambda sources: _load(sources, partial(_true_start, sources)),
     uses=(IMOS.name,),
 )

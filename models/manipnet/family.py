@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from hoidata.batches.dataset import ClipSample, HoiDataset
+from hoidata.batches.dataset import ClipSample
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import FPS, SIDES, Clip, Side
 from hoidata.geometry.rotations import rotmat_to_rot6d
@@ -76,7 +76,7 @@ def recorded_hands(sample: ClipSample, pair: HandPair) -> list[RecordedHand]:
 def diagnose(sources: Sources) -> Figures:
     """Mean joint errors of the network and of baselines without one on at most ``DIAGNOSED_CLIPS`` test clips, mm."""
     sampler = FingerSampler.load(sources)
-    train, test = (list(HoiDataset(sources.annotated, split, crop="start")) for split in ("train", "test"))
+    train, test = sources.clips("train"), sources.clips("test")
     training_hands = thinned([recorded for sample in train for recorded in recorded_hands(sample, sources.hands)])
     chosen = test[:: max(1, -(-len(test) // DIAGNOSED_CLIPS))]
     test_hands = [(sample, recorded) for sample in chosen for recorded in recorded_hands(sample, sources.hands)]

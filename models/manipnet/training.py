@@ -5,7 +5,6 @@ A step is the recorded pose of a frame and that of the next (Sec. 6.4).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from hashlib import sha256
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +22,7 @@ from hoidata.objects.surface_index import surface_index
 from hoidata.sensors import sensor_size
 from hoidata.sensors.mano_hand import mano_hands
 from models.common.family import Losses, Network, Setup
+from models.common.repeatable import seed_of
 from models.manipnet.control import Control, control_of, finger_rotmats_of, trajectories_of
 from models.manipnet.features import FeatureSettings, hand_inputs, mirrored_to_right, outputs, sizes, std_floors
 from models.manipnet.inverse_kinematics import rotvecs_from_rest
@@ -125,20 +125,15 @@ def clip_examples(
     frames = np.floor(clip_frame + 1e-6).astype(int), np.ceil(clip_frame - 1e-6).astype(int)
     time_s, examples = clip_frame / FPS, []
     for side_index, side in enumerate(SIDES):
-        if not has_steps(sample)[side_index]:
+        usable = sample.valid[side_index][frames[0]] & sample.valid[side_index][frames[1]]
+        if not (sample.active_hands[side_index] and (usable[:-1] & usable[1:]).any()):
             continue
         hand, fingers = hands[side], poses_at(finger_rotmats_of(sample.hands[side_index]), clip_frame)
-        usable = sample.valid[side_index][frames[0]] & sample.valid[side_index][frames[1]]
-        seed = int.from_bytes(sha256(f"{sample.clip_id} {side}".encode()).digest()[:7])
+        seed = seed_of(f"{sample.clip_id} {side}")
         start_rotmats = None if pool is None else perturbed_poses(fingers, mirrored_to_right(hand, pool), seed)
         steps = hand_examples(control, side, hand, fingers, time_s, usable, settings, start_rotmats)
         examples.append(steps._replace(frame=frames[0][steps.frame]))
     return examples
-
-
-def has_steps(sample: ClipSample) -> np.ndarray:
-    """(2,) bool: the hand is active and tracked in two consecutive frames."""
-    return sample.active_hands & (sample.valid[:, :-1] & sample.valid[:, 1:]).any(axis=1)
 
 
 def pose_pool(samples: Sequence[ClipSample], pair: HandPair) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hoidata.batches.dataset import ClipSample, HoiDataset
+from hoidata.batches.dataset import ClipSample
 from hoidata.batches.requests import Request, collate_requests
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.clips.features import hand_features, object_features
@@ -64,7 +64,7 @@ class OwnContact(ReportsContact):
 
 def other_contact_maps(sources: Sources) -> dict[str, Tensor]:
     """For every test clip, the least similar recorded contact map of another test clip with the same object."""
-    test, found = list(HoiDataset(sources.annotated, "test", crop="start")), {}
+    test, found = sources.clips("test"), {}
     for sample in test:
         others = [other for other in test if other.object_key == sample.object_key]
         least = min(others, key=lambda other: _shared(sample, other))

@@ -1,26 +1,32 @@
-"""Training of the diffusion network: its losses and its validation (Text2HOI, Eq. 4-7)."""
+"""Training of the diffusion network: its losses and its validation (Text2HOI, Eq. 4-7).
+
+Its checkpoint stores how training clips move: usual ranges of each verb, and which way is up for each object.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from cachetools import LRUCache, cachedmethod
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
+from hoidata.actions.action import Actions
 from hoidata.annotation.vocabulary import Vocabulary
 from hoidata.batches.dataset import ClipBatch, ClipSample
 from hoidata.clips.features import GLOBAL_ORIENT_6D
 from hoidata.devices import send
 from hoidata.geometry.rotations import rot6d_to_rotmat
+from hoidata.hands import HandPair
+from hoidata.metrics.verb_ranges import VerbRanges, object_ups, training_ranges
+from hoidata.store.annotated import AnnotatedStore
 from models.common import losses
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
 from models.common.family import ClipObjective, Losses, Network, Objective, Setup
 from models.common.features import Hands, Normaliser, object_rotmat, place_points, to_object_frame
 from models.common.sampling import TRAIN_STEPS, Motion, add_noise, alphas_cumprod
-from models.common.training_ranges import ranges_record
 from models.text2hoi.contact_training import CONTACT, ContactNetwork, SampleContact, contact_sampler
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
 from models.text2hoi.motion_representation import EncodedClip, MotionRepresentation
@@ -219,6 +225,16 @@ def motion_generator(checkpoint: Checkpoint) -> MotionGenerator:
     return MotionGenerator(checkpoint.network, checkpoint.normaliser)
 
 
+def _results(annotated: AnnotatedStore) -> dict[str, Any]:
+    return {"actions": training_ranges(annotated).record, "object_ups": object_ups(annotated)}
+
+
+def verb_ranges(checkpoint: Checkpoint, hands: HandPair) -> VerbRanges | None:
+    """The usual ranges of a checkpoint's training clips; None if it has none."""
+    record, facts = checkpoint.info["results"].get("actions"), checkpoint.facts
+    return None if record is None else VerbRanges(Actions.read(record), facts["contact_threshold_m"], hands)
+
+
 def _diffusion_objective(setup: Setup) -> tuple[Objective, Normaliser]:
     contact = setup.trained["contact"].network
     assert isinstance(contact, ContactNetwork)
@@ -256,5 +272,5 @@ DIFFUSION = Network(
     objective=_diffusion_objective,
     loss=DiffusionLossConfig,
     needs=(CONTACT.name,),
-    results=lambda network, corpus: ranges_record(corpus.annotated),
+    results=lambda network, corpus: _results(corpus.annotated),
 )

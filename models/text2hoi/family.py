@@ -10,17 +10,19 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from hoidata.annotation.encoders import TextEncoder, load_encoder, refuse_other_encoder
 from hoidata.annotation.wording import parsed_verb
-from hoidata.batches.dataset import ClipSample, HoiDataset, collate
+from hoidata.batches.dataset import ClipSample, collate
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.settings import build_config
-from models.baselines.contact_maps import mean_maps
 from models.common.checkpoints import load_checkpoint
 from models.common.family import Family, Figures, ReportsContact, Skipped, Sources
+from models.common.point_net import normalised_points
 from models.common.predicting import first_sentence
 from models.text2hoi.contact_training import (
     CONTACT,
@@ -40,9 +42,7 @@ CONTACT_SAMPLES = 32
 
 def diagnose(sources: Sources) -> Figures:
     """Contact F1 and length error on the test clips, by network, rounded to six digits."""
-    train, validation, test = (
-        list(HoiDataset(sources.annotated, split, crop="start")) for split in ("train", "validation", "test")
-    )
+    train, validation, test = map(sources.clips, ("train", "validation", "test"))
     metrics = {
         "contact": contact_metrics(sources, train, validation, test),
         "length": length_metrics(sources, train, test),
@@ -78,6 +78,40 @@ def contact_metrics(
         "f1_mean_map_of_same_object": baselines["object"],
         "threshold": threshold,
     }
+
+
+def mean_maps(train: list[ClipSample], clips: list[ClipSample], kind: str) -> np.ndarray:
+    """Baseline contact maps (clip, point) from training clips.
+
+    kind: "index": the mean by point index. "position": the mean at the nearest points in coordinates normalised to the
+    object. "object": the mean over training clips of the same object, or over all if it is new.
+    """
+    train_maps = np.stack([sample.contact_map for sample in train]).astype(np.float64)
+    if kind == "index":
+        return np.repeat(train_maps.mean(axis=0)[None], len(clips), axis=0)
+    if kind == "object":
+        keys = np.array([sample.object_key for sample in train])
+        same = [train_maps[keys == sample.object_key] for sample in clips]
+        return np.stack([maps.mean(axis=0) if len(maps) else train_maps.mean(axis=0) for maps in same])
+    points = {sample.object_key: torch.from_numpy(sample.points.points_m)[None] for sample in [*train, *clips]}
+    clouds = {key: normalised_points(cloud)[0][0].numpy() for key, cloud in points.items()}
+    train_clouds = [clouds[sample.object_key] for sample in train]
+    of_object = {
+        key: mean_map_by_position(clouds[key], train_clouds, train_maps)
+        for key in {sample.object_key for sample in clips}
+    }
+    return np.stack([of_object[sample.object_key] for sample in clips])
+
+
+def mean_map_by_position(points: np.ndarray, train_clouds: list[np.ndarray], train_maps: np.ndarray) -> np.ndarray:
+    """Probability (point,) of contact at points (point, 3): the mean over training maps of their nearest points.
+
+    Points and training clouds (point, 3) are normalised to the size of their object; train_maps (clip, point).
+    """
+    probability = np.zeros(len(points))
+    for cloud, contact in zip(train_clouds, train_maps, strict=True):
+        probability += contact[KDTree(cloud).query(points)[1]]
+    return probability / max(len(train_maps), 1)
 
 
 def length_metrics(sources: Sources, train: list[ClipSample], test: list[ClipSample]) -> dict[str, float]:
@@ -146,7 +180,7 @@ def other_prompts(sources: Sources) -> dict[str, ClipSample]:
 
     A clip is absent if all test clips have its sentence.
     """
-    test = list(HoiDataset(sources.annotated, "test", crop="start"))
+    test = sources.clips("test")
     random, chosen = np.random.default_rng(0), {}
     for sample in test:
         other = [s for s in test if s.verb != sample.verb and s.object_key != sample.object_key]
@@ -188,7 +222,7 @@ class Estimated(ReportsContact):
 
 def hand_type_accuracy(sources: Sources) -> Figures:
     """Fraction of test clips whose hand type is estimated correctly from their first sentence."""
-    test, model = list(HoiDataset(sources.annotated, "test", crop="start")), Estimated.load(sources)
+    test, model = sources.clips("test"), Estimated.load(sources)
     hands = [model.model.choose_hand(sample.sentences[0], model.encoder).hand for sample in test]
     correct = [hand == sample.hand_type for hand, sample in zip(hands, test, strict=True)]
     return {"hand_type": {"clips": len(test), "accuracy": round(float(np.mean(correct)), 6)}}

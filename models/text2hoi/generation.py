@@ -6,7 +6,6 @@ object with the axis up that is up in training; users get it in the frame of the
 """
 
 from dataclasses import asdict, dataclass, replace
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -29,7 +28,8 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import POINT_COUNT, SampledPoints, sample_points
 from models.common.checkpoints import FILE_NAME, refuse_other_inputs
 from models.common.family import motion_clip
-from models.common.training_ranges import object_ups, verb_ranges
+from models.common.repeatable import seed_of
+from models.text2hoi.diffusion_training import verb_ranges
 from models.text2hoi.length import SHORTEST_FRAMES
 from models.text2hoi.sampler import Answer, SamplingConfig, Text2Hoi
 
@@ -122,7 +122,8 @@ class Generator:
 
     @property
     def object_ups(self) -> dict[str, list[float]]:
-        return object_ups(self.model.trained["diffusion"])
+        """Direction (3,) of each training object that is up in its first frames, object frame."""
+        return self.model.trained["diffusion"].info["results"]["object_ups"]
 
     def generate(
         self,
@@ -187,9 +188,8 @@ class Generator:
     def _numbered(self, first: Request, seed: int, number: int) -> Request:
         """The request of sample ``number``; its seed depends on sentence, object and number."""
         motion_id = first.motion_id if number == 0 else f"{first.motion_id}~{number}"
-        seed_text = f"{seed} {number} {first.object.name} {first.clip_id}"
-        digest = sha256(seed_text.encode(errors="backslashreplace")).digest()
-        return replace(first, motion_id=motion_id, seed=int.from_bytes(digest[:7]), number=number)
+        request_seed = seed_of(f"{seed} {number} {first.object.name} {first.clip_id}")
+        return replace(first, motion_id=motion_id, seed=request_seed, number=number)
 
     def _length(self, request: Request, options: MotionOptions) -> int:
         """The requested number of frames, or a sampled one."""

@@ -5,7 +5,6 @@ All random numbers of a motion come from its request's seed, so it does not depe
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,11 +27,11 @@ from hoidata.settings import require_at_least
 from models.common.checkpoints import FILE_NAME, Checkpoint, load_checkpoint
 from models.common.family import Network, ReportsContact, motion_clip
 from models.common.features import Hands
+from models.common.repeatable import seed_of
 from models.common.sampling import TRAIN_STEPS, Motion, SamplerConfig, draw_each
-from models.common.training_ranges import verb_ranges
 from models.text2hoi.contact_training import CONTACT, contact_sampler, touched
 from models.text2hoi.diffusion import Condition, MotionGenerator, is_paper
-from models.text2hoi.diffusion_training import DIFFUSION, motion_generator
+from models.text2hoi.diffusion_training import DIFFUSION, motion_generator, verb_ranges
 from models.text2hoi.length import LENGTH, LengthModel
 from models.text2hoi.refiner import RefinerModel, Surface, refine
 from models.text2hoi.refiner_training import REFINER
@@ -154,7 +153,7 @@ class Text2Hoi(ReportsContact):
         best = self.candidates(requests, contact_maps)
         for attempt in range(2, self.config.attempts + 1):
             rejected = [number for number, answer in enumerate(best) if answer.rank[:2] != ACCEPTED]
-            again = [replace(requests[n], seed=_next_seed(requests[n].seed, attempt)) for n in rejected]
+            again = [replace(requests[n], seed=seed_of(f"{requests[n].seed} draw {attempt}")) for n in rejected]
             maps = None if contact_maps is None else [contact_maps[number] for number in rejected]
             for number, answer in zip(rejected, self.candidates(again, maps), strict=True):
                 better = max(best[number], answer, key=lambda candidate: candidate.rank)
@@ -229,8 +228,3 @@ class Text2Hoi(ReportsContact):
         if ranges is None:
             return answer
         return replace(answer, rank=ranges.rank(self.verb_of(request), answer.clip, request.points))
-
-
-def _next_seed(seed: int, attempt: int) -> int:
-    """Seed of the ``attempt``-th candidate of a request."""
-    return int.from_bytes(sha256(f"{seed} draw {attempt}".encode()).digest()[:7])

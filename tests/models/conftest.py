@@ -12,6 +12,7 @@ from hoidata.clips.clip import Clip, ObjectTrack
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import ObjectModel
 from hoidata.store.annotated import AnnotatedStore, load_annotated
+from models.common.corpus import Corpus
 from models.common.family import Sources
 from tests.builders.clips import clip_of, flat_hand
 from tests.builders.objects import box_model, notebook
@@ -77,6 +78,18 @@ def make_clip(number: int, plan: ToyMotion) -> Clip:
     rotvec[:, 2] = np.linspace(0, 0.5, frames)
     track = ObjectTrack(plan.model, rotvec, (path + start).astype(np.float32), hinge)
     return clip_of(f"toy/{plan.subject}/{number}", track, hands, verb=plan.verb)
+
+
+def two_clips(folder: Path) -> Corpus:
+    """A box that the right hand lifts along z in 24 frames, or passes along x in 36; also the validation clips."""
+    motions = [("lift", 24), ("pass", 36)]
+    clips = [
+        make_clip(number, ToyMotion("s1", verb, BOX, left=False, right=True, frames=frames, height_m=-0.01, eased=True))
+        for number, (verb, frames) in enumerate(motions)
+    ]
+    annotated = load_annotated(write_annotated(folder, clips))
+    dataset = HoiDataset(annotated, "train", crop="start")
+    return Corpus(annotated, dataset, dataset)
 
 
 @pytest.fixture(scope="session")

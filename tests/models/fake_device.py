@@ -35,7 +35,7 @@ from models.common.sampling import SamplerConfig
 from models.text2hoi.motion_representation import MotionRepresentation, MotionRepresentationConfig
 from models.text2hoi.sampler import NETWORKS, SamplingConfig, Text2Hoi
 from pipelines.params import merge_settings, read_params
-from tests.models.toy import PARAMS, POINT_NET, TRANSFORMER
+from tests.models.toy import PAPER, PARAMS
 
 BACKEND = "nodata"
 _setup_privateuseone_for_python_backend(BACKEND)
@@ -43,13 +43,6 @@ DEVICE = torch.device(f"{BACKEND}:0")
 TO = torch.Tensor.to
 IN_STEP = [False]
 ROOT = Path(__file__).parents[2]
-# The paper's settings, at the toy's sizes.
-PAPER: dict[str, dict[str, Any]] = {
-    "contact": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8]},
-    "length": {"width": 16},
-    "diffusion": {"transformer": TRANSFORMER},
-    "refiner": {"transformer": TRANSFORMER},
-}
 
 
 def on_host(function: Callable) -> Callable:
@@ -121,7 +114,7 @@ def on_device(stored: dict[str, Checkpoint]) -> dict[str, Checkpoint]:
 
 def trained(network: Network, preset: str, corpus: Corpus, stored: dict[str, Checkpoint]) -> None:
     """An objective, the losses of a batch, their gradients, a step of the optimiser, and the validation loss."""
-    network_settings, loss_settings = PAPER[network.name], {}
+    network_settings, loss_settings = PAPER[network.name]["network"], {}
     if preset == "ours":  # all its settings, at the toy's sizes
         ours = read_params(ROOT)["train"]["ours"][network.name]
         network_settings, loss_settings = (
@@ -180,7 +173,6 @@ def sampled(stored: dict[str, Checkpoint], sampler: SamplerConfig, requests: lis
     contact = model.sample_contact(batch, generators)
     hands, objects = model.denoise(batch, [None] * len(requests), contact, generators)
     surface = model.surface(requests)
-    assert surface is not None
     assert model.refine(batch, hands, objects, contact, surface).shape == hands.shape
 
 

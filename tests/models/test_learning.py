@@ -12,10 +12,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from hoidata.batches.dataset import ClipBatch, ClipSample, HoiDataset, collate
+from hoidata.batches.dataset import ClipBatch, ClipSample, collate
 from hoidata.clips.features import WRIST
 from hoidata.contact.maps import f1_score
-from hoidata.store.annotated import load_annotated
 from models.common.corpus import Corpus
 from models.common.family import Network, Objective, Setup
 from models.common.features import Hands
@@ -29,8 +28,7 @@ from models.text2hoi.refiner import RefinerModel, Surface
 from models.text2hoi.refiner_training import RefinerObjective, _Coarse, _Comparison
 from pipelines.stages.base import load_settings
 from pipelines.stages.train import TrainParams
-from tests.builders.stores import write_annotated
-from tests.models.conftest import BOX, ToyMotion, make_clip
+from tests.models.conftest import two_clips
 
 DELIVERED = load_settings(TrainParams, "train")
 Preset = Literal["paper", "ours"]
@@ -62,14 +60,8 @@ class Learnt:
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[Corpus, Hands]:
-    motions = [("lift", 24), ("pass", 36)]
-    clips = [
-        make_clip(number, ToyMotion("s1", verb, BOX, left=False, right=True, frames=frames, height_m=-0.01, eased=True))
-        for number, (verb, frames) in enumerate(motions)
-    ]
-    annotated = load_annotated(write_annotated(tmp_path_factory.mktemp("two"), clips))
-    dataset = HoiDataset(annotated, "train", crop="start")
-    return Corpus(annotated, dataset, dataset), Hands(annotated.store.hand_pair())
+    corpus = two_clips(tmp_path_factory.mktemp("two"))
+    return corpus, Hands(corpus.annotated.store.hand_pair())
 
 
 @pytest.fixture(scope="module", params=PRESETS)
@@ -79,7 +71,6 @@ def learnt(two: tuple[Corpus, Hands], request: pytest.FixtureRequest) -> Learnt:
         network = load_network(name)
         module, normaliser = learn(network, corpus, hands, trained, request.param)
         trained[name] = SimpleNamespace(network=module, info={"results": network.results(module, corpus)})
-    assert normaliser is not None
     networks = {name: module.network for name, module in trained.items()}
     generator = MotionGenerator(networks["diffusion"], normaliser)
     clips = list(corpus.train)
@@ -231,7 +222,6 @@ def test_the_refiner_removes_four_fifths_of_added_noise(learnt: Learnt) -> None:
     objective.pool = noisy(objective, generator, clips)
     training = overfitting(spec.training, "refiner", learnt.preset)
     refiner = fit_quickly(objective, learnt.corpus, training)
-    assert isinstance(refiner, RefinerModel)
     batch, random = collate(clips), torch.Generator().manual_seed(2)
     errors_m = np.mean(
         [wrists_off_m(refiner, objective._batch(batch, objective._coarse_motions(clips, random))) for _ in range(16)],

@@ -12,10 +12,8 @@ from torch.nn.utils.rnn import pad_sequence
 from hoidata.batches.dataset import ClipBatch, collate
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
-from hoidata.store.annotated import AnnotatedStore
-from models.common.features import Hands, Normaliser
+from models.common.features import Hands
 from models.common.point_net import PointNetConfig
-from models.common.sampling import add_noise, alphas_cumprod
 from models.common.transformer import (
     Block,
     Encoder,
@@ -210,14 +208,6 @@ def test_a_token_is_attended_to_if_any_of_its_frames_is_valid() -> None:
     ]
 
 
-def test_normalised_features_have_zero_mean_and_can_be_inverted(batch: ClipBatch) -> None:
-    normaliser = Normaliser.of(list(zip(batch.hands, batch.object, batch.present, strict=True)))
-    hands, objects = normaliser.encode(batch.hands, batch.object)
-    assert float(hands.transpose(0, 1)[batch.present.transpose(0, 1)].mean(0).abs().max()) < 1e-3
-    for restored, original in zip(normaliser.decode(hands, objects), (batch.hands, batch.object), strict=True):
-        torch.testing.assert_close(restored, original, atol=1e-5, rtol=1e-4)
-
-
 def test_packing_removes_masked_tokens_without_changing_the_others() -> None:
     torch.manual_seed(0)
     encoder, x = Encoder(SMALL).eval(), torch.randn(3, 20, 32)
@@ -234,17 +224,6 @@ def test_packing_removes_masked_tokens_without_changing_the_others() -> None:
         )
     torch.testing.assert_close(together[mask], alone, atol=1e-5, rtol=1e-4)
     assert packed(torch.randn(3, 21, 32), wide)[0].shape[1] == int(wide.sum(1).max())
-
-
-def test_a_clip_gives_the_same_alone_and_padded_in_a_batch(annotated: AnnotatedStore, batch: ClipBatch) -> None:
-    model = diffusion_model()
-    alone = collate([batch.samples[0]])
-    with torch.no_grad():
-        many = model(batch.hands, batch.object, torch.full((3,), 300), condition_of(batch))
-        one = model(alone.hands, alone.object, torch.full((1,), 300), condition_of(alone))
-    length, side = batch.samples[0].length, int(batch.active_hands[0].float().argmax())
-    torch.testing.assert_close(many[0][0, side, :length], one[0][0, side], atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(many[1][0, :length], one[1][0], atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("contact_input", ["map", "tokens"])
@@ -269,7 +248,6 @@ def test_text_verb_contact_hands_and_object_change_the_motion(
 
 def test_a_verb_that_is_not_in_training_adds_nothing(batch: ClipBatch) -> None:
     model, condition = diffusion_model(), condition_of(batch)
-    assert model.verb_in is not None
     none, strange = (model.encode_condition(replace(condition, verbs=[verb] * 3)) for verb in (None, "juggle"))
     assert torch.equal(none.token, strange.token)
     lift = model.encode_condition(replace(condition, verbs=["lift"] * 3)).token
@@ -310,55 +288,19 @@ def noise_like(coarse: CoarseMotion, seed: int) -> Tensor:
     return torch.randn(coarse.hands.shape, generator=torch.Generator().manual_seed(seed))
 
 
-def test_noise_is_mixed_as_in_the_papers_first_equation() -> None:
-    signal = torch.tensor([0.81, 0.36])
-    noised = add_noise(torch.ones(2, 3), torch.full((2, 3), 2.0), torch.tensor([0, 1]), signal)
-    torch.testing.assert_close(noised[:, 0], torch.tensor([0.9 + 2 * 0.19**0.5, 0.6 + 2 * 0.8]))
-
-
-def fitted(parameters, loss, steps: int = 150, rate: float = 3e-3) -> float:
-    optimiser = torch.optim.Adam(parameters, lr=rate)
-    value = torch.zeros(())
-    for _ in range(steps):
-        optimiser.zero_grad()
-        value = loss()
-        value.backward()
-        optimiser.step()
-    return float(value.detach())
-
-
-def two_clips(batch: ClipBatch) -> ClipBatch:
-    return collate(list(batch.samples[:2]))
-
-
 def test_the_length_model_overfits_two_clips_and_keeps_its_variance(batch: ClipBatch) -> None:
     torch.manual_seed(0)
-    two, verbs = two_clips(batch), ["lift", "pass"]
+    two, verbs = collate(list(batch.samples[:2])), ["lift", "pass"]
     model = LengthModel(LengthConfig(width=64, sampled_from="gaussian", verbs=VERBS))
     lengths, inputs = torch.tensor([40, 120]), (two.text[:, 0], verbs, torch.zeros(2, 1))
-    fitted(model.parameters(), lambda: length_loss(*model.moments(*inputs), lengths)["total"], rate=5e-3)
+    optimiser = torch.optim.Adam(model.parameters(), lr=5e-3)
+    for _ in range(150):
+        optimiser.zero_grad()
+        length_loss(*model.moments(*inputs), lengths)["total"].backward()
+        optimiser.step()
     torch.testing.assert_close(model.expected_frames(two.text[:, 0], verbs), lengths.float(), atol=2.0, rtol=0)
     samples = model.sample(two.text[:1, 0].expand(200, -1), ["lift"] * 200, torch.Generator().manual_seed(0))
     assert samples.float().std() > 0.5
     assert samples.min() >= 8
     other = model.expected_frames(two.text[:1, 0], ["pass"])
     assert abs(float(other - model.expected_frames(two.text[:1, 0], ["lift"]))) > 1
-
-
-@pytest.mark.slow
-def test_the_generator_overfits_two_clips(batch: ClipBatch) -> None:
-    two = two_clips(batch)
-    model = diffusion_model().train()
-    normaliser = Normaliser.of(list(zip(two.hands, two.object, two.present, strict=True)))
-    hands, objects = normaliser.encode(two.hands, two.object)
-    signal, generator = alphas_cumprod(), torch.Generator().manual_seed(0)
-    condition = condition_of(two)
-
-    def loss() -> Tensor:
-        steps = torch.randint(1000, (2,), generator=generator)
-        noised = [add_noise(x, torch.randn(x.shape, generator=generator), steps, signal) for x in (hands, objects)]
-        clean = model(noised[0], noised[1], steps, condition)
-        return (clean[0] - hands)[two.present].square().mean() + (clean[1] - objects)[two.frames].square().mean()
-
-    first = float(loss().detach())
-    assert fitted(model.parameters(), loss, 200) < 0.1 * first

@@ -25,11 +25,14 @@ from models.common.progress import Line, Progress, State
 from models.common.team import Team, run_team
 from models.common.training import _add_gradients, train_network
 from models.registry import load_network
-from tests.models.toy import BUDGET, PARAMS
+from tests.models.toy import BIMART, BUDGET, PARAMS
 
 STEPS, SAVED_EVERY = 8, 2
-# The toy's networks, and ManipNet's.
-SETTINGS = PARAMS | {"manipnet": {"network": {"encoder": 8}, "training": BUDGET, "loss": {"steps_per_clip": 4}}}
+# The toy's networks, ManipNet's, and one of BimArt's.
+SETTINGS = PARAMS | {
+    "manipnet": {"network": {"encoder": 8}, "training": BUDGET, "loss": {"steps_per_clip": 4}},
+    "bimart-motion": BIMART,
+}
 
 
 def train(name: str, root: Path, out: Path, *, progress: Path | None = None, die_at: int = 0, **training) -> None:

@@ -53,7 +53,6 @@ def test_a_store_keeps_the_joint_without_an_origin_and_is_sound(drawer: ObjectMo
     assert store.objects["hinge_origin_m"].tolist() == [None]
     assert check_store(tmp_path / "store") == []
     model, clip = store.object_model("drawer"), store.clip("toy/s1/drawer_open_1")
-    assert model.hinge is not None
     assert model.hinge.is_prismatic
     np.testing.assert_array_equal(clip.object.hinge_rad, SLIDE_M)
     local = articulate(model.vertices_m, model.part, model.hinge, clip.object.hinge_rad)
@@ -62,7 +61,6 @@ def test_a_store_keeps_the_joint_without_an_origin_and_is_sound(drawer: ObjectMo
 
 def test_a_slide_and_a_hinge_of_one_axis_have_different_digests(drawer: ObjectModel) -> None:
     hinge = drawer.hinge
-    assert hinge is not None
     turning = ObjectModel(drawer.name, drawer.vertices_m, drawer.faces, drawer.part, Hinge(hinge.axis, hinge.origin_m))
     assert turning.digest != drawer.digest
 

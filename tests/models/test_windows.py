@@ -1,4 +1,4 @@
-"""Windows of whole clips: which ones, their motion and contact, and their evaluation; sampling resumes."""
+"""Windows of whole clips: which ones, their motion and contact, and their evaluation."""
 
 import os
 from collections import defaultdict
@@ -11,7 +11,6 @@ import pytest
 from hoidata.batches.dataset import HoiDataset, contact_of
 from hoidata.clips.clip import SIDES
 from hoidata.errors import BadInput
-from hoidata.files.arrays import read_npz
 from hoidata.hands import load_embedded_hands
 from hoidata.metrics.evaluate import evaluate_store
 from hoidata.metrics.optional_metrics import select_metrics
@@ -19,7 +18,6 @@ from hoidata.metrics.target_contact import read_target_contact
 from hoidata.settings import build_config
 from hoidata.store.annotated import AnnotatedStore, WindowedStore, WindowProtocol, load_annotated
 from hoidata.store.store import open_store
-from models.common.family import Sources
 from models.common.predicting import PredictionConfig, sample_family
 from models.registry import load_family
 
@@ -108,56 +106,6 @@ def test_without_a_window_nothing_is_sampled(annotated_root: Path, tmp_path: Pat
     section = {"samples": 1, "windows": {}}  # the toy clips are shorter than 328 frames
     counts = sample_family(load_family("ground-truth"), annotated_root, tmp_path, tmp_path / "out", section, HANDS)
     assert counts == {"clips": 0}
-
-
-@pytest.mark.slow
-def test_interrupted_sampling_continues_to_the_same_bytes(
-    sources: Sources, annotated_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("models.common.predicting.CLIPS_AT_ONCE", 1)
-    family, calls = load_family("text2hoi"), list[int]()
-
-    def sampled(name: str, stop_at: int | None = None) -> Path:
-        sampler = family.load(sources)
-
-        class Counted:
-            def sample_with_targets(self, requests):
-                calls.append(len(requests))
-                if len(calls) == stop_at:
-                    raise KeyboardInterrupt
-                return sampler.sample_with_targets(requests)  # pyright: ignore
-
-            def sample(self, requests):
-                raise AssertionError
-
-        counted = type(family)(**{**vars(family), "load": lambda _: Counted()})
-        settings, out = dict(sources.settings), tmp_path / name
-        sample_family(
-            counted,
-            annotated_root,
-            sources.checkpoints,
-            out,
-            SECTION,
-            HANDS,
-            settings=settings,
-            progress=tmp_path / "p",
-        )
-        return out
-
-    with pytest.raises(KeyboardInterrupt):
-        sampled("resumed", stop_at=2)
-    assert (tmp_path / "p").is_dir()
-    first = len(calls) - 1
-    resumed = sampled("resumed")
-    again = len(calls) - first - 1
-    assert not (tmp_path / "p").exists()
-    calls.clear()
-    whole = sampled("whole")
-    assert (first, again) == (1, len(calls) - 1)
-    files = sorted(path.relative_to(whole) for path in whole.rglob("*") if path.is_file())
-    assert files == sorted(path.relative_to(resumed) for path in resumed.rglob("*") if path.is_file())
-    assert all((whole / path).read_bytes() == (resumed / path).read_bytes() for path in files)
-    assert read_npz(whole / "asked.npz")["asked"].any()
 
 
 def test_the_windowed_dataset_of_a_project_is_read(annotated_root: Path) -> None:

@@ -43,6 +43,24 @@ PARAMS = {
 }
 
 
+# Either of BimArt's networks.
+BIMART = {
+    "network": {
+        "features": {
+            "basis": {"count": 8},
+            "keypoints": 20,
+            "window_frames": 16,
+            "state": "local",
+            "max_distance_m": 0.2,
+        },
+        "transformer": {"width": 16, "layers": 1, "heads": 2, "feed_forward": 16, "norm_first": True},
+        "encoder": [16],
+        "condition_on_hands": True,
+        "diffusion_steps": 1000,
+    },
+    "training": {"steps": 4, "batch": 2, "learning_rate": 0.001, "validate_every": 2},
+}
+
 # Preset `paper` with small layers.
 SMALL_TRANSFORMER = {"width": 32, "layers": 1, "heads": 2, "feed_forward": 32}
 PAPER = {

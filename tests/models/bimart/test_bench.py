@@ -32,8 +32,9 @@ from hoidata.store.annotated import WindowProtocol
 from models.bimart.scene import Scene
 from pipelines.stages.train import TrainParams
 from tests.builders.objects import hinged_box
-from tests.models.bimart.test_family import PARAMS, SETTINGS
+from tests.models.bimart.test_family import SETTINGS
 from tests.models.bimart.test_sampling import path_features
+from tests.models.toy import BIMART
 
 PROJECT = Path(__file__).parents[3]
 
@@ -41,7 +42,7 @@ PROJECT = Path(__file__).parents[3]
 @pytest.mark.long
 def test_every_method_is_trained_and_measured(annotated_root: Path, tmp_path: Path) -> None:
     section = yaml.safe_load((PROJECT / "params.yaml").read_text())["train"]
-    tiny = {name: PARAMS for name in ("bimart-contact", "bimart-motion")}
+    tiny = {name: BIMART for name in ("bimart-contact", "bimart-motion")}
     train = build_config(TrainParams, {**section, "paper": {}, "ours": {}, "small": tiny, "size": "small"}, "train")
     training = {"steps": 2, "batch": 2, "learning_rate": 0.001, "validate_every": 1}
     run = Run(

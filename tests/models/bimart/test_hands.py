@@ -20,31 +20,25 @@ from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.part_bps import BasisSettings, hand_keypoints
 from models.bimart.family import BimArtSampler
 from models.bimart.hands import HandSamplingOptions, SampledHands, hands_for
-from models.bimart.network import ContactModel, DenoiserConfig, MotionModel
-from models.bimart.sampler import OURS, BimArt, BimArtSamplerConfig
+from models.bimart.network import ContactModel, MotionModel
+from models.bimart.sampler import BimArt
 from models.bimart.scene import FeatureConfig, Scene
-from models.common.transformer import TransformerConfig
 from pipelines.pages.hands_page import ARRAYS, MAPS_OVER_TIME, write_hands
 from tests.builders.objects import hinged_box
+from tests.models.bimart.test_sampling import FAST, TINY
 
 pytestmark = pytest.mark.slow
 
 PAIR = load_embedded_hands()
 FEATURES = FeatureConfig(BasisSettings(16), keypoints=24, window_frames=16, state="local", max_distance_m=0.2)
-TINY = DenoiserConfig(
-    FEATURES,
-    TransformerConfig(width=16, layers=1, heads=2, feed_forward=16, dropout=0.0),
-    (8,),
-    condition_on_hands=True,
-    position_dropout=0.0,
-)
 
 
 @pytest.fixture(scope="module")
 def sampler() -> BimArtSampler:
     """Untrained networks whose output has the size of hands."""
     torch.manual_seed(0)
-    contact, motion = ContactModel(TINY), MotionModel(TINY)
+    config = replace(TINY, features=FEATURES)
+    contact, motion = ContactModel(config), MotionModel(config)
     ids = hand_keypoints(PAIR.right, FEATURES.keypoints)
     points_m = np.concatenate([PAIR[side].template_m[ids] + [0, 0, 0.03] for side in SIDES]).ravel()
     with torch.no_grad():
@@ -53,8 +47,7 @@ def sampler() -> BimArtSampler:
         motion.keypoint_ids.copy_(torch.from_numpy(ids))
         contact.mean.fill_(0.02)
         contact.scale.fill_(0.005)
-    sampling = replace(OURS, sampler=BimArtSamplerConfig("ddim", 2, 0.5))
-    model = BimArt(contact.eval(), motion.eval(), sampling, torch.device("cpu"))
+    model = BimArt(contact.eval(), motion.eval(), FAST, torch.device("cpu"))
     return BimArtSampler(model, PAIR, synthetic=True)
 
 
@@ -77,7 +70,6 @@ def test_the_object_track_is_unchanged_and_both_hands_are_in_all_frames(motions,
         assert motion.clip.synthetic
 
 
-@pytest.mark.slow
 def test_a_sample_is_repeatable_and_does_not_depend_on_the_number_of_samples(sampler, path, motions):
     alone = hands_for(sampler, path.track, HandSamplingOptions(seed=3))[0]
     for side in SIDES:
@@ -86,7 +78,6 @@ def test_a_sample_is_repeatable_and_does_not_depend_on_the_number_of_samples(sam
         assert not np.array_equal(first.wrist_m, other.wrist_m)
 
 
-@pytest.mark.slow
 def test_only_the_requested_hand_is_sampled(sampler, path):
     left = hands_for(sampler, path.track, HandSamplingOptions(hand="left"))[0]
     assert left.clip.hands["left"].valid.all()
@@ -148,7 +139,6 @@ def test_too_short_a_motion_is_bad_input(sampler, path):
         hands_for(sampler, path.track.take(slice(0, 5)))
 
 
-@pytest.mark.slow
 def test_files_and_page_are_repeatable_and_each_array_is_documented(motions, path, tmp_path):
     def written(folder: str) -> list[Path]:
         digests = {"checkpoints/bimart-motion/model.safetensors": "ab" * 32}

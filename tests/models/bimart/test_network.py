@@ -7,20 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from hoidata.sensors.part_bps import BasisSettings
 from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel, Windows, contact_channels
 from models.bimart.scene import FeatureConfig, RecordedClip, Scene, split_motion
 from models.bimart.training import LossConfig, Moments, Targets, window_losses
-from models.common.transformer import TransformerConfig
-
-FEATURES = FeatureConfig(BasisSettings(3), keypoints=4, window_frames=8, state="local")
-TINY = DenoiserConfig(
-    FEATURES,
-    TransformerConfig(width=16, layers=1, heads=2, feed_forward=16, dropout=0.0),
-    (8,),
-    condition_on_hands=True,
-    position_dropout=0.0,
-)
+from tests.models.bimart.test_sampling import TINY
 
 
 def linear(inputs: int, outputs: int) -> int:
@@ -104,7 +94,6 @@ def test_an_inactive_hand_and_a_missing_part_have_no_effect_and_no_output(networ
     mask, whole = network.channel_mask(windows), predicted(network, windows, x)
     assert not whole[~mask].any()
     corrupted = torch.where(mask, x, 1e3)
-    assert windows.contact_m is not None
     contact = torch.where(contact_channels(windows), windows.contact_m, 1e3)
     offset = torch.where(windows.point_exists.repeat_interleave(3, 1)[:, None], windows.basis_offset, 1e3)
     torch.testing.assert_close(
@@ -122,7 +111,6 @@ def test_windows_of_a_batch_are_independent(network: Denoiser) -> None:
 
 def test_a_dropped_contact_map_has_no_effect_and_the_contact_model_has_no_map(network: Denoiser) -> None:
     windows, x, steps = random_windows([8, 8], 8), torch.randn(2, 8, len(network.mean)), torch.full((2,), 399)
-    assert windows.contact_m is not None
     other = replace(windows, contact_m=windows.contact_m * 2)
     outputs = [network(x, steps, condition, torch.tensor([True, False])) for condition in (windows, other)]
     torch.testing.assert_close(outputs[0][0], outputs[1][0])

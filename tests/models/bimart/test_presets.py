@@ -9,13 +9,10 @@ import pytest
 import yaml
 
 from hoidata.batches.dataset import ClipSample
-from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
 from hoidata.settings import build_config
-from models.bimart.network import DenoiserConfig
-from models.bimart.sampler import SamplingConfig, preset_of, sampling_of
-from models.bimart.scene import FeatureConfig, Scene, hand_vertices_m, recorded_clip
-from models.bimart.training import LossConfig
+from models.bimart.sampler import preset_of, sampling_of
+from models.bimart.scene import Scene, hand_vertices_m, recorded_clip
 from models.common.training import TrainingSpec
 from models.registry import load_network
 from pipelines.stages.train import TrainParams
@@ -66,7 +63,6 @@ def test_the_papers_networks_and_training_have_the_numbers_of_section_3_5() -> N
         assert (training.batch, training.steps) == (100, 218_000)
         assert (training.learning_rate, training.weight_decay, training.schedule) == (1e-4, 0, "cosine")
         assert training.ema_decay > 0
-        assert isinstance(plan.loss, LossConfig)
         assert (plan.loss.contact_dropout, plan.loss.velocity_weight) == (0.5, 0)
 
 
@@ -108,17 +104,3 @@ def test_the_papers_scale_leaves_a_margin_of_15_percent(samples: list[ClipSample
     # Eq. 1; the axis of a rigid object goes through its origin.
     farthest_m = np.linalg.norm(vertices_m - scene.object_from_canonical.translation, axis=1).max()
     assert scene.object_scale * farthest_m == pytest.approx(0.85)
-
-
-@pytest.mark.parametrize(
-    ("config", "old", "new"),
-    [
-        (FeatureConfig, "most_m", "max_distance_m"),
-        (DenoiserConfig, "floor", "min_std_fraction"),
-        (LossConfig, "windows", "windows_per_clip"),
-        (SamplingConfig, "guide", "contact_guidance"),
-    ],
-)
-def test_a_renamed_key_is_refused_with_its_new_name(config: type, old: str, new: str) -> None:
-    with pytest.raises(BadInput, match=f"{old} is now {new}"):
-        build_config(config, {old: 1}, "params.yaml: train")

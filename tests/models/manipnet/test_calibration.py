@@ -79,10 +79,8 @@ def test_random_offsets_and_motions_are_recovered_in_files_and_frames(seed: int)
         tracker = moved.wrists[side]
         quaternion = Rotation.from_matrix(tracker.rotmats[3]).as_quat()[[3, 0, 1, 2]]
         frame = parse_frame(json.dumps({"time_s": 1, side: [*tracker.position_m[3], *quaternion]}).encode())
-        assert frame is not None
         assert frame.wrists["left" if side == "right" else "right"] is None
         pose = calibrated_frame(frame, measured).wrists[side]
-        assert pose is not None
         np.testing.assert_allclose(pose.translation, wrists[side].translation[3], atol=1e-4)
         np.testing.assert_allclose(pose.rotation, wrists[side].rotation[3], atol=1e-4)
         assert f"{100 * np.linalg.norm(offsets[side].inverse().translation):.1f} cm" in notes[SIDES.index(side)]

@@ -28,11 +28,9 @@ def datagram(**changes: object) -> bytes:
 
 def test_a_datagram_is_a_frame_with_metres_and_w_first() -> None:
     frame = parse_frame(datagram(), is_hinged=True)
-    assert frame is not None
     assert (frame.time_s, frame.wrists["left"], frame.hinge_rad) == (1.25, None, dict.fromkeys(SIDES, 0.5))
     for side in SIDES:
         pose = frame.objects[side]
-        assert pose is not None
         np.testing.assert_allclose(pose.rotation, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
         np.testing.assert_array_equal(pose.translation, POSE[:3])
 
@@ -42,9 +40,7 @@ def test_the_left_hands_own_object_is_lost_if_it_is_missing() -> None:
         parse_frame(datagram(), has_left_object=True),
         parse_frame(datagram(left_object=[0, 0, 2, *POSE[3:]]), False, True),
     )
-    assert lost is not None
     assert (lost.objects["left"], lost.objects["right"] is None) == (None, False)
-    assert frame is not None
     assert frame.objects["left"] is not None
     assert frame.objects["left"].translation[2] == 2
     assert frame.objects["right"] is not None
@@ -54,7 +50,6 @@ def test_the_left_hands_own_object_is_lost_if_it_is_missing() -> None:
 @pytest.mark.parametrize("lost", [None, [nan] * 7, [inf, *POSE[1:]], [*POSE[:6], nan]])
 def test_null_and_numbers_that_are_not_finite_are_a_lost_body(lost: object) -> None:
     frame = parse_frame(datagram(object=lost))
-    assert frame is not None
     assert list(frame.objects.values()) == [None, None]
     assert frame.wrists["right"] is not None
 
@@ -156,7 +151,6 @@ def test_a_recording_of_a_tracker_has_its_motion_and_says_where_a_wrist_was_lost
             parse_frame(datagram(time_s=number / 60, object=at, right=None if lost else at, hinge_rad=number))
         )
     control, valid = control_of_frames([frame for frame in frames if frame], hinged_box())
-    assert control is not None
     time_s = np.arange(61) / 30
     for motion in (control.object_motion, control.wrists["right"]):
         np.testing.assert_allclose(motion.position_m, time_s[:, None] * [1, 0, 0], atol=1e-9)

@@ -50,14 +50,10 @@ PARAMS = {
 }
 
 
-def trained_twice(root: Path, out: Path) -> Path:
-    return train_network(MANIPNET, root, out / "manipnet", PARAMS)
-
-
 @pytest.fixture(scope="module")
 def checkpoints(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("fingers")
-    trained_twice(annotated_root, out)
+    train_network(MANIPNET, annotated_root, out / "manipnet", PARAMS)
     return out
 
 
@@ -100,8 +96,6 @@ def test_random_fingers_in_the_recording_give_the_same_motion(
             fingers.sample(requests_for(one_sample, PredictionConfig(samples=1)))[0]
             for one_sample in (sample, corrupted)
         )
-        assert isinstance(original, Clip)
-        assert isinstance(other, Clip)
         assert_same_hands(original, other)
 
 
@@ -111,7 +105,6 @@ def test_wrists_and_object_are_those_of_the_recording(
     for sample in samples:
         (motion,) = fingers.sample(requests_for(sample, PredictionConfig(samples=1)))
         recorded = annotated.clip(sample.clip_id)
-        assert isinstance(motion, Clip)
         np.testing.assert_allclose(motion.object.translation_m, recorded.object.translation_m, atol=1e-5)
         for side_index, side in enumerate(SIDES):
             assert motion.hands[side].valid.all() == sample.active_hands[side_index]
@@ -173,14 +166,8 @@ def test_thinned_training_frames_are_spread_over_all_hands(
     assert errors["joint_error_nearest_frame_mm"] < errors["joint_error_mean_pose_mm"]
 
 
-def test_two_trainings_give_the_same_bytes(annotated_root: Path, checkpoints: Path, tmp_path: Path) -> None:
-    again = trained_twice(annotated_root, tmp_path)
-    assert again.read_bytes() == (checkpoints / "manipnet" / "model.safetensors").read_bytes()
-
-
 def test_a_checkpoint_stores_step_hand_and_joint_limits(checkpoints: Path) -> None:
     network = load_checkpoint(checkpoints / "manipnet", MANIPNET).network
-    assert isinstance(network, ManipNet)
     assert network.config.features.step_s == 1 / FPS
     assert network.config.joints == 16
     assert (network.high_rad > network.low_rad).all()

@@ -10,7 +10,7 @@ import torch
 import yaml
 
 from hoidata.batches.dataset import ClipSample
-from hoidata.clips.clip import FPS, SIDES, Clip, Side
+from hoidata.clips.clip import FPS, SIDES, Side
 from hoidata.datasets import RawTree
 from hoidata.datasets.manipnet.adapter import read_hand_recording
 from hoidata.geometry.motion import Motion
@@ -41,7 +41,7 @@ from models.manipnet.rollout import (
     paper_targets,
     roll_out,
 )
-from models.manipnet.training import MANIPNET, LossConfig, clip_examples, sized_config
+from models.manipnet.training import MANIPNET, clip_examples, sized_config
 from pipelines.stages.train import TrainParams
 from tests.builders.manipnet import KEY, lift_rows, write_skin, write_tree
 from tests.builders.objects import box_model
@@ -194,7 +194,6 @@ def test_the_rule_of_post_processing_is_that_of_the_preset(definition: Literal["
 def test_the_papers_training_is_adam_at_1e_4_with_32_recorded_steps_at_60_hz() -> None:
     plan = training_plan("paper")
     training, loss = plan.training, plan.loss
-    assert isinstance(loss, LossConfig)
     assert (training.learning_rate, training.weight_decay, training.schedule) == (1e-4, 0.0, "constant")
     assert training.batch * loss.steps_per_clip == 32
     assert loss.perturbed_fraction == 0
@@ -251,7 +250,6 @@ def test_a_network_of_preset_paper_gives_fingers_for_each_frame_of_a_clip(
     sampler = FingerSampler.load(Sources(annotated, tmp_path, HANDS, torch.device("cpu")))
     assert (sampler.predictor.settings, sampler.predictor.chosen_rule) == (PAPER, "paper")
     (motion,) = sampler.sample(requests_for(samples[0], PredictionConfig(samples=1)))
-    assert isinstance(motion, Clip)
     assert motion.n_frames == samples[0].length
     side = SIDES[int(samples[0].active_hands[1])]
     poses = motion.hands[side].hand_pose

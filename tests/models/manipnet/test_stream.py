@@ -177,7 +177,6 @@ def with_fault(frames: list[TrackedFrame | None], kind: str, side: Side, faulty:
         if one is None:
             continue
         wrist = one.wrists[side]
-        assert wrist is not None
         changed: dict[str, RigidTransform | None] = {
             "wrist": None,
             "nan": NAN,
