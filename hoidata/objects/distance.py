@@ -11,6 +11,8 @@ import numpy as np
 from hoidata.errors import BadInput
 from hoidata.geometry.rows import distinct_rows
 
+CHUNK_POINTS = 1 << 17
+
 
 class ClosestPoints(NamedTuple):
     """The closest surface point of each query point."""
@@ -41,8 +43,8 @@ def closest_points(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndarr
     Raises BadInput: the mesh has no triangle of positive area, or a vertex is not finite.
     """
     surface = merged_surface(vertices_m, faces)
-    points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 3)
-    square, _, closest = igl.point_mesh_squared_distance(points, *surface)
+    parts = [igl.point_mesh_squared_distance(chunk, *surface)[::2] for chunk in _chunks(points_m)]
+    square, closest = (np.concatenate(column) for column in zip(*parts, strict=True))
     return ClosestPoints(np.sqrt(square), closest.reshape(-1, 3))
 
 
@@ -82,10 +84,19 @@ def unmatched_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def is_closed(faces: np.ndarray) -> bool:
     """Whether each directed edge occurs as often as its opposite: a closed, consistently oriented surface."""
-    return not unmatched_edges(faces)[1].any()
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    size = int(faces.max()) + 1
+    forward = np.sort(edges[:, 0] * size + edges[:, 1])
+    backward = np.sort(edges[:, 1] * size + edges[:, 0])
+    return bool(np.array_equal(forward, backward))
 
 
 def volume_m3(vertices_m: np.ndarray, faces: np.ndarray) -> float:
     """Volume of a closed surface by the divergence theorem; negative if its triangles face inward."""
     corners = (vertices_m - vertices_m.mean(axis=0))[faces]
     return float(np.einsum("fx,fx->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
+
+
+def _chunks(points_m: np.ndarray) -> list[np.ndarray]:
+    points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 3)
+    return [points[start : start + CHUNK_POINTS] for start in range(0, max(len(points), 1), CHUNK_POINTS)]

@@ -60,6 +60,13 @@ def test_an_inverted_mesh_has_the_same_inside(queries: np.ndarray, missing: int)
     np.testing.assert_allclose(inward.normal, outward.normal, atol=1e-12)
 
 
+def test_a_box_with_a_small_hole_still_knows_its_inside() -> None:
+    sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
+    points = np.array([[0.0, 0, 0], [0.02, 0, 0], [0.1, 0, 0]])
+    result = signed_distance(sphere.vertices, sphere.faces[1:], points)
+    assert (result.distance_m < 0).tolist() == [True, True, False]
+
+
 @pytest.mark.parametrize(
     ("vertices", "faces"), [(np.zeros((3, 3)), [[0, 1, 2]]), (np.full((3, 3), np.nan), [[0, 1, 2]])]
 )
