@@ -33,17 +33,21 @@ class Encoder(Protocol):
     @property
     def name(self) -> str:
         """The suffix of the metrics that use this encoder."""
+        ...
 
     @property
     def digest(self) -> str:
         """SHA-256 of weights and configuration."""
+        ...
 
     @property
     def labels(self) -> tuple[str, ...]:
         """The verbs of the logits, in order; empty for an encoder that does not classify."""
+        ...
 
     def encode(self, motions: Sequence[Motion], sides: Sequence[tuple[Side, ...]]) -> Encoding:
         """Encode motions. ``sides`` are the acting hands of each; the other hands are ignored."""
+        ...
 
     def encode_text(self, text: np.ndarray) -> np.ndarray | None:
         """(clip, F) features of sentences (clip, 512) in the feature space of motions; None for a classifier."""

@@ -131,7 +131,9 @@ def carried_fraction(pair: HandPair, clip: Clip) -> float:
     if not len(in_air):
         return 1.0
     frames = in_air[((np.arange(AIR_FRAMES) + 0.5) * len(in_air) / AIR_FRAMES).astype(int)]
-    tracks = {side: clip.hands[side].take(frames) for side in SIDES if clip.hands[side].valid.any()}
+    tracks: dict[Side, HandTrack] = {
+        side: clip.hands[side].take(frames) for side in SIDES if clip.hands[side].valid.any()
+    }
     if not tracks:
         return 0.0
     capsules = joined([capsules_or_nan(track, pair[side]) for side, track in tracks.items()])

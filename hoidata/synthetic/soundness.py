@@ -92,7 +92,7 @@ def force_residuals(truth: TruthSequence, near: dict[Side, SignedDistance], pair
     wrench = required_wrench(motion, FPS, GRAVITY)
     patches, residuals = {side: hand_patches(pair[side]) for side in near}, []
     for frame in np.flatnonzero(truth.lifted):
-        contacts = [patch_contacts(one, patches[side], frame) for side, one in near.items()]
+        contacts = [patch_contacts(one, patches[side], int(frame)) for side, one in near.items()]
         world_from_object = track.world_from_object[frame]
         points = world_from_object @ np.concatenate([contact.points_m for contact in contacts])
         normals = world_from_object.turn(np.concatenate([contact.normals for contact in contacts]))
@@ -119,6 +119,6 @@ def _idle(truth: TruthSequence, pair: HandPair) -> float:
     middle = (base.min(0) + base.max(0)) / 2
     radius = np.linalg.norm(base - middle, axis=1).max()
     centre = track.world_from_object @ middle[None]
-    idle = [side for side in SIDES if side not in truth.active_sides and truth.hands[side].valid.any()]
+    idle: list[Side] = [side for side in SIDES if side not in truth.active_sides and truth.hands[side].valid.any()]
     joints = [track_joints(truth.hands[side], pair[side]) for side in idle]
     return min((np.linalg.norm(positions - centre, axis=2).min() - radius for positions in joints), default=np.inf)
