@@ -176,7 +176,7 @@ class Hands(nn.Module):
     def _sides(
         self, hands: Tensor, betas: Tensor, template_m: Tensor | None
     ) -> Iterator[tuple[HandKinematics, tuple[Tensor, Tensor, Tensor, Tensor | None]]]:
-        """The layer of each side with its arguments, all frames of all clips at once."""
+        """The layer of each side, and its arguments for all frames."""
         for side, layer in enumerate(self.kinematics):
             assert isinstance(layer, HandKinematics)
             flat, n_frames = hands[:, side].reshape(-1, HAND_FEATURES), hands.shape[2]

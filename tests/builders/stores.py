@@ -48,7 +48,7 @@ def write_annotated(
 
 
 def write_two_verbs(root: Path) -> list[Clip]:
-    """Write and annotate five clips of two verbs and three subjects, the last two of them for tests."""
+    """Write and annotate five clips of two verbs and three subjects, the last two for tests."""
     plans = [("s1", "lift"), ("s1", "open"), ("s2", "lift"), ("s3", "lift"), ("s3", "open")]
     clips = [
         build_clip(20, seed=seed, clip_id=f"toy/{subject}/{seed}", subject=subject, verb=verb)
