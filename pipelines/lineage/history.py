@@ -1,4 +1,4 @@
-"""Queries to git: uncommitted files, and the versions of a file."""
+"""Queries to git: uncommitted files, the versions of a file, and the commit that added a text."""
 
 import subprocess
 from collections.abc import Iterable, Iterator
@@ -44,3 +44,10 @@ class History:
             for commit in self._git("log", f"-n{MAX_COMMITS}", "--format=%H", "--", path).decode().split():
                 if content := self.text(commit, path):
                     yield commit, path, content
+
+    def commit_with(self, text: str, files: Iterable[str]) -> str | None:
+        """The oldest commit that added ``text`` to one of ``files``."""
+        if not self.exists:
+            return None
+        commits = self._git("log", "--format=%H", "--reverse", f"-S{text}", "--", *files).decode().split()
+        return commits[0] if commits else None

@@ -176,9 +176,7 @@ def _target_of_digest(root: Path, digest: str) -> Target:
             is_there = (root / path).exists()
             return _target_at(root, root / path) if is_there else _missing_target(root, locks, lock.name, path)
     history, files = History(root), _possible_locks(root)
-    for commit, _, content in history.versions(files):
-        if digest.encode() not in content:
-            continue
+    if commit := history.commit_with(digest, files):
         locks_then = parse_locks({file: text for file in files if (text := history.text(commit, file))})
         for lock in locks_then.values():
             if path := _out_with(root, lock, digest):
