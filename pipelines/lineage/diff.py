@@ -102,9 +102,9 @@ def _unexplained(
     first: dict[str, Any], second: dict[str, Any], pairs: dict[str, tuple[dict | None, dict | None]]
 ) -> list[str]:
     """The first data that differs although all its recorded causes are equal; else weights that do."""
-    for one, other in reversed(list(pairs.values())):
-        if one is None or other is None:
-            continue
+    for one, other in reversed([pair for pair in pairs.values() if None not in pair]):
+        assert one is not None
+        assert other is not None
         for path, digest in one["inputs"].items():
             if path in other["inputs"] and other["inputs"][path] != digest:
                 return [f"data {path}: differs, although all its recorded causes are equal"]

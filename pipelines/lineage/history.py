@@ -1,5 +1,6 @@
-"""Queries to git: uncommitted files, the versions of a file, and the commit that added a text."""
+"""Queries to git: uncommitted files, and the commits that had a recorded file or parameter."""
 
+import hashlib
 import subprocess
 from collections.abc import Iterable, Iterator
 from functools import cached_property
@@ -14,9 +15,10 @@ class History:
     def __init__(self, root: Path) -> None:
         self._root = root
 
-    def _git(self, *arguments: str) -> bytes:
+    def _git(self, *arguments: str, stdin: bytes = b"") -> bytes:
         try:
-            return subprocess.run(["git", *arguments], cwd=self._root, capture_output=True, check=True).stdout
+            command = ["git", "-c", "core.quotepath=off", *arguments]
+            return subprocess.run(command, cwd=self._root, input=stdin, capture_output=True, check=True).stdout
         except (OSError, subprocess.CalledProcessError):
             return b""
 
@@ -39,11 +41,29 @@ class History:
         return self._git("show", f"{commit}:{path}")
 
     def versions(self, paths: Iterable[str]) -> Iterator[tuple[str, str, bytes]]:
-        """Commit, path and content of all versions of some files, of each file the newest first."""
-        for path in paths if self.exists else ():
-            for commit in self._git("log", f"-n{MAX_COMMITS}", "--format=%H", "--", path).decode().split():
-                if content := self.text(commit, path):
-                    yield commit, path, content
+        """Commit, path and content of all versions of some files, newest first."""
+        named = list(paths)
+        if not (named and self.exists):
+            return
+        log = self._git("log", f"-n{MAX_COMMITS}", "--raw", "--no-abbrev", "--no-renames", "--format=%H", "--", *named)
+        commit, entries = "", []
+        for line in log.decode().splitlines():
+            if line.startswith(":"):
+                fields, _, path = line.partition("\t")
+                entries.append((commit, path, fields.split()[3]))
+            elif line:
+                commit = line
+        contents = self._blobs([blob for _, _, blob in entries])
+        yield from ((commit, path, contents[blob]) for commit, path, blob in entries if blob in contents)
+
+    def commits_of(self, digests: Iterable[tuple[str, str]]) -> dict[tuple[str, str], str]:
+        """The newest commit that has each (path, SHA-256); pairs that no commit has are omitted."""
+        requested, commits = set(digests), {}
+        for commit, path, content in self.versions({path for path, _ in requested}):
+            key = (path, hashlib.sha256(content).hexdigest())
+            if key in requested:
+                commits.setdefault(key, commit[:10])
+        return commits
 
     def commit_with(self, text: str, files: Iterable[str]) -> str | None:
         """The oldest commit that added ``text`` to one of ``files``."""
@@ -51,3 +71,14 @@ class History:
             return None
         commits = self._git("log", "--format=%H", "--reverse", f"-S{text}", "--", *files).decode().split()
         return commits[0] if commits else None
+
+    def _blobs(self, names: list[str]) -> dict[str, bytes]:
+        data, contents, start = self._git("cat-file", "--batch", stdin="\n".join(names).encode()), {}, 0
+        while start < len(data):
+            end = data.index(b"\n", start)
+            name, kind, *size = data[start:end].decode().split()
+            start = end + 1
+            if kind == "blob":
+                contents[name] = data[start : start + int(size[0])]
+                start += int(size[0]) + 1
+        return contents

@@ -115,9 +115,11 @@ def _recorded_in(root: Path, path: Path, stage: str) -> str | None:
 
     if records_output(locks):
         return "in dvc.lock"
+    searched = set()
     for commit, file, content in history.versions(_possible_locks(root)):
-        if records_output(parse_locks({file: content})):
+        if content not in searched and records_output(parse_locks({file: content})):
             return f"in {file} of commit {commit[:10]}"
+        searched.add(content)
     return ""
 
 

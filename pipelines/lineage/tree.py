@@ -1,6 +1,5 @@
 """The lineage of a file as a tree: all its inputs, each compared with the present project."""
 
-from collections import ChainMap
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -115,6 +114,7 @@ class _Comparison:
     target: Target
     shown: set[str] = field(default_factory=set)  # stages that the tree has already
     digests: dict[str, str | None] = field(default_factory=dict)  # cache of ``digest``
+    code_files: dict[str, dict[str, str]] = field(default_factory=dict)  # cache of ``code_of``, by stage
 
     @cached_property
     def stages(self) -> dict[str, Any]:
@@ -140,12 +140,10 @@ class _Comparison:
 
     @cached_property
     def code_today(self) -> dict[str, dict[str, str]]:
-        """The digests of the files that each stage of the record would run now."""
         from pipelines.stages.code import code_today
 
-        files = {name: self.stages_today[name].code if name in self.stages_today else () for name in self.stages}
-        today = code_today(self.home, {file for names in files.values() for file in names})
-        return {name: dict(ChainMap(*(today.get(file, {}) for file in names))) for name, names in files.items()}
+        files = {file for name in self.stages for file in self.stages_today.get(name, _NO_STAGE).code}
+        return code_today(self.home, files)
 
     @cached_property
     def history(self) -> History:
@@ -155,6 +153,24 @@ class _Comparison:
     def locked_outputs(self) -> dict[str, str]:
         """MD5 of all outputs in dvc.lock, by path."""
         return {path: md5 for lock in read_locks(self.home).values() for path, md5 in lock.outs.items()}
+
+    @cached_property
+    def commits(self) -> dict[tuple[str, str], str]:
+        """The commits that have the recorded versions of code files that have changed."""
+        changed = [
+            (path, digest)
+            for name, record in self.stages.items()
+            for path, digest in record["code"].items()
+            if self.code_of(name).get(path) != digest
+        ]
+        return self.history.commits_of(changed)
+
+    def code_of(self, name: str) -> dict[str, str]:
+        if name not in self.code_files:
+            files = self.stages_today.get(name, _NO_STAGE).code
+            today = (self.code_today.get(file, {}).items() for file in files)
+            self.code_files[name] = {path: digest for items in today for path, digest in items}
+        return self.code_files[name]
 
     def stage(self, name: str) -> Node:
         if name in self.shown:
@@ -186,7 +202,8 @@ class _Comparison:
         except BadInput:
             return Node("param", key, "missing", f"was {recorded}")
         if now != recorded:
-            return Node("param", key, "changed", "; ".join(value_changes(recorded, now)))
+            changes = "; ".join(value_changes(recorded, now))
+            return Node("param", key, "changed", f"{changes}{self.as_committed(key, recorded)}")
         is_edited = "params.yaml" in self.history.uncommitted
         if is_edited and self.value_in(self.history.text("HEAD", "params.yaml"), key) != now:
             return Node("param", key, "uncommitted", str(recorded))
@@ -195,14 +212,22 @@ class _Comparison:
     def value_in(self, text: bytes, key: str) -> Any:
         """A param in the text of another params.yaml, with today's profile; None if it is not there."""
         try:
-            return look_up(chosen_params({**load_yaml(text), "profile": self.params["profile"]}), key)
+            values = load_yaml(text)
+            if "profile" in self.params:
+                values["profile"] = self.params["profile"]
+            return look_up(chosen_params(values), key)
         except (BadInput, ValueError, TypeError, AttributeError, RecursionError):
             return None
+
+    def as_committed(self, key: str, recorded: Any) -> str:
+        versions = self.history.versions(["params.yaml"])
+        commit = next((commit for commit, _, text in versions if self.value_in(text, key) == recorded), None)
+        return f" (as recorded in commit {commit[:10]})" if commit else ""
 
     def code(self, stage: str) -> Node:
         """One node for a stage's code, with a child per file that it ran then or would run now."""
         recorded = self.stages[stage]["code"]
-        today = {} if self.root is None else self.code_today[stage]
+        today = {} if self.root is None else self.code_of(stage)
         if self.root is not None and recorded and all(path.startswith("code/") for path in recorded):
             return Node("code", "code", "changed", "the code has changed; its files are not recorded")
         children = tuple(self.file(path, recorded.get(path), today.get(path)) for path in sorted({*recorded, *today}))
@@ -215,7 +240,8 @@ class _Comparison:
         if self.root is None:
             return Node("code", path, "recorded", digest=digest)
         if today != recorded:
-            detail = "" if recorded else "not in the recorded code"
+            commit = self.commits.get((path, recorded or ""))
+            detail = f"as recorded in commit {commit}" if commit else "" if recorded else "not in the recorded code"
             return Node("code", path, "missing" if today is None else "changed", detail, digest=digest)
         return Node("code", path, "uncommitted" if path in self.history.uncommitted else "same", digest=digest)
 
@@ -255,6 +281,9 @@ class _Comparison:
         folder = raw_folder(self.root, path, listed)
         status, detail = raw_status(folder, listed)
         return Node("raw", folder.as_posix() if folder else listed.dataset, status, detail)
+
+
+_NO_STAGE = Stage("", (), (), ())
 
 
 def raw_folder(root: Path, path: str, listed: RawList) -> Path | None:

@@ -55,6 +55,13 @@ def test_manifest_comes_back_as_written(raw, tmp_path):
     assert read_manifest(tmp_path / "grab.json") == manifest
 
 
+def test_a_manifest_without_files_is_read_as_written(tmp_path):
+    manifest = Manifest("grab", True, "generated", "CC0-1.0", recipe={"seed": 0, "size": "full"})
+    write_manifest(tmp_path / "grab.json", manifest)
+    assert read_manifest(tmp_path / "grab.json") == manifest
+    assert manifest.synthetic
+
+
 def test_committed_manifests_have_the_format_of_write_manifest(tmp_path):
     for path in (Path(__file__).parents[3] / "manifests").glob("*/*.json"):
         write_manifest(tmp_path / "again.json", read_manifest(path))
