@@ -11,7 +11,7 @@ Finished runs are in its ``table1.json``, so a killed command continues. ``table
 import json
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -35,9 +35,9 @@ METRIC = {metric.name: metric for metric in ALL_METRICS}
 ORDERED_BY = "accuracy_top3_paper"
 STATIC = [ordering for ordering in EXPECTED_ORDERINGS if ordering.control == "static"]
 LEGEND = (
-    "±: 95 % interval over repetitions of sampling. In parentheses: 95 % interval over clips, of metrics that are "
-    "measured on one repetition. Both are means over training seeds; sd: standard deviation over training seeds."
+    "±: 95 % interval over repetitions of sampling; in parentheses: over clips, of metrics measured on one repetition."
 )
+SEEDS_LEGEND = " Both are means over training seeds; sd: standard deviation over training seeds."
 # ``table1.json``: by ``<run> <seed>`` the digest of its settings, processor seconds by stage, and metrics by method.
 Results = Mapping[str, Mapping[str, Any]]
 # By seed: ``value``, and its intervals ``repetitions`` and ``clips`` if there are any.
@@ -136,17 +136,15 @@ class PaperTable:
             write_whole(path, canonical_json(results))
         return {name: results[name] for name in self.runs()}
 
-    def markdown(self, results: Results) -> str:
-        """The tables of the runs, their order, and the paper's numbers."""
-        parts = [f"{self.content['budget']} {LEGEND}"]
+    def markdown(self, results: Results, hidden: Collection[str] = ()) -> str:
+        """The tables of the runs but for the ``hidden`` titles, their order, and the paper's numbers."""
+        seeds_legend = SEEDS_LEGEND if len(self.rows[0].of(results)) > 1 else ""
+        parts = [f"{self.content['budget']} {LEGEND}{seeds_legend}"]
         minutes = {line: self.minutes(line, results) for line in self.rows}
         for title, columns in self.content["columns"].items():
-            lines = [
-                [line.title, *(cell(line, results, METRIC[name]) for name in columns.values()), minutes[line]]
-                for line in self.rows
-            ]
-            head = ["method", *columns, "processor minutes, training + sampling"]
-            parts.append(f"{title}:\n\n{markdown_lines(head, lines)}")
+            if title in hidden:
+                continue
+            parts.append(f"{title}:\n\n{self.table(columns, results, minutes)}")
         if any(line.reference for line in self.rows):
             parts.append(f"Difference from the reference row:\n\n{self.differences(results)}")
         if paper := self.content.get("paper"):
@@ -159,6 +157,22 @@ class PaperTable:
             parts += [paper["reasons"], markdown_lines(["paper", *paper["columns"]], lines)]
         return "\n\n".join(part.rstrip() for part in parts) + "\n"
 
+    def table(self, columns: Mapping[str, str], results: Results, minutes: Mapping[Row, str]) -> str:
+        """One table of all rows; a column without any value is a line below it."""
+        empty = {
+            title: self.rows[0].reason(results, name).partition(":")[0]
+            for title, name in columns.items()
+            if not any(line.values(results, name) for line in self.rows)
+        }
+        shown = {title: METRIC[name] for title, name in columns.items() if title not in empty}
+        lines = [
+            [line.title, *(cell(line, results, metric) for metric in shown.values()), minutes[line]]
+            for line in self.rows
+        ]
+        table = markdown_lines(["method", *shown, "processor minutes, training + sampling"], lines)
+        notes = "; ".join(f"{title}: {reason}" for title, reason in empty.items())
+        return table + (f"\n\nMeasured in no row: {notes}." if empty else "")
+
     def minutes(self, line: Row, results: Results) -> str:
         """Processor minutes of all trainings of the row's package and of its sampling, mean over seeds."""
         graph, sums = f"models/{family_module(line.family).split('.')[1]}/dvc.yaml", []
@@ -167,7 +181,7 @@ class PaperTable:
             trained = sum(value for stage, value in seconds.items() if stage.startswith(f"{graph}:train"))
             sampled = seconds.get(f"{sample}-{line.family}", seconds.get(sample, 0))  # a sole family has no suffix
             sums += [(trained / 60, sampled / 60)] if trained else []
-        return " + ".join(f"{mean(values):.1f}" for values in zip(*sums, strict=True)) or "–"
+        return "+".join(f"{mean(values):.1f}" for values in zip(*sums, strict=True)) or "–"
 
     def differences(self, results: Results) -> str:
         """Per row and column of the first table, the difference from the reference row."""
@@ -206,7 +220,7 @@ def cell(line: Row, results: Results, metric: AnyMetric) -> str:
 
 
 def difference(metric: AnyMetric, seeds: Seeds, others: Seeds, recorded: Seeds) -> str:
-    """``-0.120 ± 0.030, worse``: the difference of two rows and its 95 % interval; no word if the interval has 0.
+    """``-0.120±0.030, worse``: the difference of two rows and its 95 % interval; no word if the interval has 0.
 
     Intervals are over repetitions, or over clips for metrics that are measured on one repetition.
     """
@@ -216,7 +230,7 @@ def difference(metric: AnyMetric, seeds: Seeds, others: Seeds, recorded: Seeds) 
     value, other, half = mean_value(seeds), mean_value(others), sum(one**2 for one in halves) ** 0.5
     better = is_better(metric, value, other, mean_value(recorded) if recorded else None)
     verdict = "" if abs(value - other) <= half or better is None else ", better" if better else ", worse"
-    return f"{value - other:+.3f} ± {half:.3f}{verdict}"
+    return f"{value - other:+.3f}±{half:.3f}{verdict}"
 
 
 def make(name: str, corpus: str) -> int:

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from itertools import product
+from pathlib import Path
 from statistics import stdev
 
 import pytest
@@ -136,7 +137,7 @@ def test_a_difference_counts_if_it_exceeds_both_intervals(metric, value, word):
         [{"value": value, "repetitions": (value - 0.03, value + 0.03)}],
         [{"value": 0.5, "repetitions": (0.46, 0.54)}],
     )
-    assert difference(metric, seeds, others, []) == f"{value - 0.5:+.3f} ± 0.050{word}"
+    assert difference(metric, seeds, others, []) == f"{value - 0.5:+.3f}±0.050{word}"
 
 
 @pytest.mark.parametrize(("accuracy", "code"), [([0.1, 0.2], 0), ([0.5, 0.6], 1)])
@@ -200,3 +201,11 @@ def test_a_table_is_made_from_a_whole_run(tmp_path, monkeypatch):
     assert table.fill(project) == finished
     lines = table.markdown(finished).splitlines()
     assert next(line for line in lines if line.startswith("| MDM |")).split(" | ")[-1] != "– |"
+
+
+def test_a_column_without_values_is_a_line_below_the_table():
+    table = PaperTable("table1", "study")
+    text = table.markdown(json.loads((Path(__file__).parents[1] / "docs/results/table1-study.json").read_text()))
+    head = next(line for line in text.splitlines() if line.startswith("| method"))
+    assert "Fréchet" not in head
+    assert "Measured in no row: FID, Fréchet, from training clips: N too small." in text

@@ -24,6 +24,8 @@ from pipelines.pages.metrics_table import ALL_METRICS
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs/results"
 PAGES = (ROOT / "README.md", ROOT / "docs/results.md")
+# Columns of the papers' tables that only the benchmark prints.
+HIDDEN = {"table2": ("This project's metrics",)}
 PLACE = re.compile(r"<!--results:(?P<name>[\w-]+)-->\n.*?<!--end-->", re.DOTALL)
 MEASURED_SHARE = 0.95  # below, a cell has the number of measured clips
 METRIC = {metric.name: metric for metric in ALL_METRICS}
@@ -229,6 +231,12 @@ def markdown(table: Table) -> str:
     return markdown_lines(head, lines)
 
 
+def paper_table(name: str) -> str:
+    """A table of a paper, such as ``table1-study``."""
+    table = PaperTable(*name.split("-"))
+    return table.markdown(read(name), HIDDEN.get(table.name, ())).rstrip()
+
+
 def best_methods(methods: Methods, column: str, recorded: Mapping[str, Any]) -> set[str]:
     """The methods that no other beats in a column, by the numbers shown."""
     name, decimals = COLUMNS[column]
@@ -266,8 +274,7 @@ def filled(text: str) -> str:
 
     def table(match: re.Match[str]) -> str:
         name = match["name"]
-        rows = markdown(TABLES[name]) if name in TABLES else PaperTable(*name.split("-")).markdown(read(name)).rstrip()
-        return f"<!--results:{name}-->\n{rows}\n<!--end-->"
+        return f"<!--results:{name}-->\n{markdown(TABLES[name]) if name in TABLES else paper_table(name)}\n<!--end-->"
 
     return PLACE.sub(table, text)
 

@@ -80,8 +80,8 @@ def check_soundness(truths: Sequence[TruthSequence]) -> None:
     for truth, direction in zip(truths, directions, strict=True):
         assert is_sound(truth, pair)
         assert not is_sound(shifted(truth, np.array([0.0, 0.0, 0.2])), pair)
-        for distance_m in (0.0, 0.01, 0.3):
-            moved = shifted(truth, distance_m * direction).at_30_fps()
+        for shift_m in (np.zeros(3), 0.01 * direction, np.array([0.0, 0.0, 0.3])):
+            moved = shifted(truth, shift_m).at_30_fps()
             residuals = force_residuals(moved, surface_distances(moved, pair), pair)
             explained.append((len(residuals), (residuals < RESIDUAL_LIMIT).sum()))
     n_frames, n_explained = np.array(explained).reshape(len(truths), 3, 2).sum(axis=0).T
