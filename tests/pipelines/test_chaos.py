@@ -227,6 +227,35 @@ def test_a_write_error_is_reported_and_leaves_the_old_outputs(built, typed, repe
 @only_in_chaos
 @in_namespace
 @repeated
+@pytest.mark.parametrize("stage", ["convert", "contact", "train"])
+def test_a_full_disk_is_reported_and_leaves_the_old_outputs(built, typed, repetition, stage):
+    """The folder of the outputs is a small file system that is almost full."""
+    folder = "checkpoints/embedded/grab" if stage == "train" else "data/embedded/grab"
+    script = f"""
+        set -e
+        room=$(( $(du -sk {folder} | cut -f1) + {(8, 24, 60)[repetition]} ))
+        mount -t tmpfs -o size=${{room}}k none /mnt
+        cp -a {folder}/. /mnt/
+        mount --bind /mnt {folder}
+        code=0
+        {" ".join(STAGE)} {" ".join(STAGES[stage])} || code=$?
+        find {folder} -name '.*' -prune -o -type f -print | sort | xargs md5sum > "$OUT"
+        exit $code
+    """
+    listing = built.parent / "listing"
+    before = subprocess.run(
+        f"find {folder} -name '.*' -prune -o -type f -print | sort | xargs md5sum",
+        shell=True, cwd=built, capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+    done = typed("unshare", "-m", "env", f"OUT={listing}", "sh", "-c", script)
+    assert (done.returncode, "No space left" in done.stderr) == (1, True), done.stderr
+    assert listing.read_text() == before
+    assert typed(*STAGE, *STAGES[stage]).returncode == 0
+
+
+@only_in_chaos
+@in_namespace
+@repeated
 def test_an_unwritable_cache_is_reported_before_any_stage_runs(built, typed, repetition):
     make_stale(built, "contact")
     before = outputs(built)
