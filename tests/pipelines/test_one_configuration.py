@@ -1,8 +1,9 @@
-"""The settings of the contact stage reach labels, masks, losses and pages."""
+"""The settings of the contact stage reach labels, masks, losses and pages; each default is defined once."""
 
+import ast
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from hoidata.batches.dataset import HoiDataset, collate
+from hoidata.contact.settings import ContactSettings
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.settings import plain_config
 from hoidata.store.annotated import AnnotatedStore, load_annotated
@@ -30,6 +32,12 @@ SHIFT_M = np.float32([0.006, 0.004, 0.004])
 RULE = {"by": "subject", "train": "rest", "validation": ["s9"], "test": ["s10"]}
 # In params.yaml although it equals the default, because users look for it there.
 SHOWN_ON_PURPOSE = {"annotate.encoder"}
+# Constants with the value of the contact threshold and another meaning.
+OTHER_LENGTHS = {
+    "LONGEST_EDGE_M", "STAND_RADIUS_M", "LARGEST_DISTANCE_M", "REACH_M", "HANDS_BELOW", "TOUCH_M",
+    "GUIDANCE_RANGE_M", "MAX_BELOW_FRACTION", "FADES_M", "DEEP_M", "TRAVEL_M",
+    "STILL_M_S", "MOVING_M_S", "MIN_GAIN", "OUTLIER_M",
+}  # fmt: skip
 
 
 def annotated_at(folder: Path, threshold_m: float, make_clip, monkeypatch) -> AnnotatedStore:
@@ -117,3 +125,33 @@ def test_params_repeat_no_defaults_of_the_library():
         same = {f"{section}.{name}" for name, value in said.items() if value is not None and value == defaults[name]}
         repeated |= same
     assert repeated == SHOWN_ON_PURPOSE
+
+
+@pytest.mark.slow
+def test_threshold_and_number_of_points_are_defined_once():
+    """Of all constants and default values in the code, one is the threshold and one the number of points."""
+    homes: dict[float, list[str]] = {0.02: [], 1024: []}
+    for room in ("hoidata", "models", "pipelines"):
+        for path in sorted((PROJECT / room).rglob("*.py")):
+            for name, value in constants(ast.parse(path.read_text(encoding="utf-8"))):
+                if value in homes and ("threshold" in name.lower() or "point" in name.lower() or name.isupper()):
+                    homes[value].append(name)
+    assert [name for name in homes[0.02] if name not in OTHER_LENGTHS] == ["CONTACT_THRESHOLD_M"]
+    assert homes[1024].count("POINT_COUNT") == 1
+    assert {item.name: item.default for item in fields(ContactSettings)} == {"points": 1024, "threshold_m": 0.02}
+
+
+def constants(tree: ast.Module) -> list[tuple[str, float]]:
+    """(name, number) of all assignments, annotated fields and default values of arguments."""
+    assignments: list[tuple[ast.expr | ast.arg, ast.expr | None]] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assign):
+            assignments += [(target, node.value) for target in node.targets]
+        elif isinstance(node, ast.AnnAssign):
+            assignments.append((node.target, node.value))
+        elif isinstance(node, ast.arguments):
+            positional = [*node.posonlyargs, *node.args]
+            assignments += list(zip(positional[len(positional) - len(node.defaults) :], node.defaults, strict=True))
+            assignments += list(zip(node.kwonlyargs, node.kw_defaults, strict=True))
+    names = ((getattr(target, "id", None) or getattr(target, "arg", ""), value) for target, value in assignments)
+    return [(name, value.value) for name, value in names if isinstance(value, ast.Constant) and name]

@@ -1,5 +1,8 @@
 """Text encoders: identity, determinism, independence of a sentence from its neighbours, and clear refusals."""
 
+import os
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -94,3 +97,13 @@ def test_missing_clip_weights_are_named_at_once_with_the_way_out() -> None:
 def test_an_unknown_encoder_is_refused(name: str) -> None:
     with pytest.raises(BadInput, match="text encoder"):
         load_encoder(name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("threads", ["1", "2"])
+def test_features_are_the_same_on_any_number_of_processors(threads: str) -> None:
+    code = "import sys; from hoidata.annotation.encoders import load_encoder as f; "
+    code += f"sys.stdout.buffer.write(f('use').encode({SENTENCES!r}).tobytes())"
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=True)
+    assert done.stdout == load_encoder("use").encode(SENTENCES).tobytes()

@@ -9,6 +9,7 @@ import torch
 from hoidata.batches.dataset import HoiDataset, collate
 from hoidata.batches.frame_selection import FrameSelection
 from hoidata.clips import SIDES, Clip, ObjectTrack
+from hoidata.clips.features import upright
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands, track_joints
@@ -215,3 +216,14 @@ def test_personal_templates_come_along_or_are_refused_in_a_mixture(clips: Clips)
     np.testing.assert_allclose(batch.template_m.numpy(), expected, atol=1e-6)
     with pytest.raises(BadInput, match="mixture"):
         collate([personal, HoiDataset(clips, "train")[1]])
+
+
+@pytest.mark.parametrize("gravity", [(0, 0, -1), (0, 0, 1), (0, -1, 0), (1, 2, -3), None])
+def test_upright_is_a_rotation_that_turns_gravity_down(gravity: tuple | None) -> None:
+    rotation = upright(None if gravity is None else np.array(gravity))
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    if gravity is None or gravity == (0, 0, -1):
+        np.testing.assert_array_equal(rotation, np.eye(3))
+    else:
+        np.testing.assert_allclose(rotation @ gravity / np.linalg.norm(gravity), [0, 0, -1], atol=1e-12)

@@ -10,6 +10,7 @@ from hoidata.geometry.rotations import (
     rotmat_to_rot6d,
     rotmat_to_rotvec,
     rotvec_to_rotmat,
+    skew,
 )
 
 ANGLES = (0.0, 1e-9, 1e-7, 9e-7, 1.1e-6, 1e-4, 0.1, 1.0, 3.0, np.pi - 1e-6, np.pi)
@@ -109,3 +110,14 @@ def test_canonical_axis_angles_are_the_same_rotations_of_at_most_pi_and_shorter_
     short = np.linalg.norm(vectors, axis=1) < 3.15
     assert result[short].tobytes() == vectors[short].tobytes()
     assert result.dtype == dtype
+
+
+def test_rotation_about_z_takes_x_towards_y():
+    quarter = rotvec_to_rotmat(np.array([0.0, 0.0, np.pi / 2]))
+    np.testing.assert_allclose(quarter @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-15)
+
+
+def test_skew_is_the_cross_product():
+    generator = torch.Generator().manual_seed(0)
+    first, second = torch.randn(2, 4, 3, generator=generator, dtype=torch.float64)
+    torch.testing.assert_close((skew(first) @ second[..., None])[..., 0], torch.linalg.cross(first, second))
