@@ -30,10 +30,9 @@ def run(paths: StagePaths) -> None:
 def generated_files(paths: StagePaths, manifest: Manifest) -> tuple[SourceFile, ...]:
     """Write the corpus of the manifest's recipe, unless recipe and code are unchanged, and list its files."""
     root = paths.generated_raw
-    stamp, digest = root.with_suffix(".recipe"), recipe_digest(manifest)
-    if not (root.is_dir() and stamp.is_file() and stamp.read_text() == digest):
+    stamp = root.with_suffix(".recipe")
+    if not (root.is_dir() and stamp.is_file() and stamp.read_text() == recipe_digest(manifest)):
         write_generated(paths, manifest, root)
-        write_whole(stamp, digest)
     return scan_files(root, configured_adapter(paths.dataset).parts)
 
 
@@ -43,13 +42,17 @@ def recipe_digest(manifest: Manifest) -> str:
 
 
 def write_generated(paths: StagePaths, manifest: Manifest, root: Path) -> None:
-    """Write the corpus of the manifest's recipe into ``root``, completely or not at all."""
+    """Write the corpus of the manifest's recipe into ``root``, completely or not at all.
+
+    The file ``<root>.recipe`` beside it marks it as generated, for ``convert`` and ``adapters check``.
+    """
     from hoidata.synthetic.corpus import write_corpus
 
     recipe = manifest.recipe or {}
     if {name: type(value) for name, value in recipe.items()} != {"seed": int, "size": str}:
         raise BadInput(paths.manifest, "a recipe of seed and size", repr(recipe)[:80], "restore it with git checkout")
     write_corpus(source_of(paths.dataset), root, recipe["seed"], recipe["size"], jobs())
+    write_whole(root.with_suffix(".recipe"), recipe_digest(manifest))
 
 
 def require_hand(paths: StagePaths) -> None:

@@ -12,10 +12,12 @@ from typer.testing import CliRunner, Result
 
 from hoidata.datasets import get_adapter
 from hoidata.errors import BadInput, MissingResource
+from hoidata.store.store import open_store
 from pipelines.cli import app
 from pipelines.lineage.manifests import ABSENT_HAND, write_manifest
 from pipelines.stages.adapters import manifest_of
 from pipelines.stages.base import StagePaths, load_hands, raw_root
+from pipelines.stages.raw import write_generated
 
 PROJECT = Path(__file__).parents[2]
 
@@ -203,6 +205,19 @@ def test_any_profile_whose_manifests_are_recipes_has_generated_files_and_the_emb
     assert load_hands("mine").name == "embedded"
     with pytest.raises(MissingResource, match="hoidata synth write grab --profile mine"):
         raw_root(StagePaths("mine", "grab"))
+
+
+@pytest.mark.slow
+def test_convert_takes_a_generated_corpus_with_the_embedded_hand(tmp_path, stage_folder, monkeypatch, small_corpus):
+    written = small_corpus("grab").raw  # in place of minutes of generation
+    monkeypatch.setattr("hoidata.synthetic.corpus.write_corpus", lambda _, root, *__: shutil.copytree(written, root))
+    paths = StagePaths("embedded", "grab")
+    write_generated(paths, manifest_of(paths), tmp_path / "grab")
+    words = ("convert", "grab", "--root", tmp_path / "grab", "--out", tmp_path / "store", "--jobs", 1)
+    result = CliRunner().invoke(app, [*map(str, words)])
+    assert result.exit_code == 0, result.output
+    store = open_store(tmp_path / "store")
+    assert store.clip(store.ids[0]).synthetic
 
 
 def test_commands_outside_of_a_project_are_refused(tmp_path, project_tools):
