@@ -37,7 +37,7 @@ STATIC = [ordering for ordering in EXPECTED_ORDERINGS if ordering.control == "st
 LEGEND = (
     "±: 95 % interval over repetitions of sampling; in parentheses: over clips, of metrics measured on one repetition."
 )
-SEEDS_LEGEND = " Both are means over training seeds; sd: standard deviation over training seeds."
+SEEDS_LEGEND = " Values and both are means over {} training seeds; the last ±: standard deviation over these seeds."
 # ``table1.json``: by ``<run> <seed>`` the digest of its settings, processor seconds by stage, and metrics by method.
 Results = Mapping[str, Mapping[str, Any]]
 # By seed: ``value``, and its intervals ``repetitions`` and ``clips`` if there are any.
@@ -137,14 +137,19 @@ class PaperTable:
         return {name: results[name] for name in self.runs()}
 
     def markdown(self, results: Results, hidden: Collection[str] = ()) -> str:
-        """The tables of the runs but for the ``hidden`` titles, their order, and the paper's numbers."""
-        seeds_legend = SEEDS_LEGEND if len(self.rows[0].of(results)) > 1 else ""
-        parts = [f"{self.content['budget']} {LEGEND}{seeds_legend}"]
+        """The tables of the runs, their order, and the paper's numbers.
+
+        hidden: titles of tables, metrics, and ``texts`` for the text that is the same for every corpus.
+        """
+        n_seeds = len(self.rows[0].of(results))
+        seeds_legend = SEEDS_LEGEND.format(n_seeds) if n_seeds > 1 else ""
+        parts = [] if "texts" in hidden else [f"{self.content['budget']} {LEGEND}{seeds_legend}"]
         minutes = {line: self.minutes(line, results) for line in self.rows}
         for title, columns in self.content["columns"].items():
-            if title in hidden:
-                continue
-            parts.append(f"{title}:\n\n{self.table(columns, results, minutes)}")
+            if title not in hidden:
+                shown = {header: name for header, name in columns.items() if name not in hidden}
+                parts.append(f"{title}:\n\n{self.table(shown, results, minutes)}")
+                minutes = {}
         if any(line.reference for line in self.rows):
             parts.append(f"Difference from the reference row:\n\n{self.differences(results)}")
         if paper := self.content.get("paper"):
@@ -154,22 +159,24 @@ class PaperTable:
             theirs = sorted(methods, key=lambda name: -methods[name][0])
             parts.append(f"Order by top-3 accuracy: {' > '.join(here)}. In the paper: {' > '.join(theirs)}.")
             lines = [[name, *map(str, values)] for name, values in methods.items()]
-            parts += [paper["reasons"], markdown_lines(["paper", *paper["columns"]], lines)]
+            parts += [] if "texts" in hidden else [paper["reasons"]]
+            parts.append(markdown_lines(["paper", *paper["columns"]], lines))
         return "\n\n".join(part.rstrip() for part in parts) + "\n"
 
     def table(self, columns: Mapping[str, str], results: Results, minutes: Mapping[Row, str]) -> str:
-        """One table of all rows; a column without any value is a line below it."""
+        """One table of all rows, with any ``minutes`` in the last column; a column without value is a line below it."""
         empty = {
             title: self.rows[0].reason(results, name).partition(":")[0]
             for title, name in columns.items()
             if not any(line.values(results, name) for line in self.rows)
         }
         shown = {title: METRIC[name] for title, name in columns.items() if title not in empty}
-        lines = [
-            [line.title, *(cell(line, results, metric) for metric in shown.values()), minutes[line]]
-            for line in self.rows
-        ]
-        table = markdown_lines(["method", *shown, "processor minutes, training + sampling"], lines)
+        lines = [[line.title, *(cell(line, results, metric) for metric in shown.values())] for line in self.rows]
+        head = ["method", *shown]
+        if minutes:
+            head.append("processor minutes, training + sampling")
+            lines = [[*cells, minutes[line]] for cells, line in zip(lines, self.rows, strict=True)]
+        table = markdown_lines(head, lines)
         notes = "; ".join(f"{title}: {reason}" for title, reason in empty.items())
         return table + (f"\n\nMeasured in no row: {notes}." if empty else "")
 
@@ -216,7 +223,7 @@ def cell(line: Row, results: Results, metric: AnyMetric) -> str:
         text += f"±{number(half)}"
     elif ends := [seed["clips"] for seed in seeds if "clips" in seed]:
         text += " ({}–{})".format(*(number(mean(end)) for end in zip(*ends, strict=True)))
-    return text + (f", sd {number(stdev(seed['value'] for seed in seeds))}" if len(values) > 1 else "")
+    return text + (f"±{number(stdev(seed['value'] for seed in seeds))}" if len(values) > 1 else "")
 
 
 def difference(metric: AnyMetric, seeds: Seeds, others: Seeds, recorded: Seeds) -> str:

@@ -116,7 +116,7 @@ def results(**methods: dict) -> dict:
 def test_a_cell_has_the_mean_the_interval_over_repetitions_and_the_spread_over_seeds():
     half = 4.302653 * 0.1 / 3**0.5  # Student's t for three repetitions, standard deviation .1
     text = cell(Row("MDM", "ours", "mdm"), results(), ACCURACY)
-    assert text == f"0.600±{half:.3f}, sd {stdev([0.5, 0.7]):.3f}"
+    assert text == f"0.600±{half:.3f}±{stdev([0.5, 0.7]):.3f}"
 
 
 def test_a_cell_without_repetitions_has_the_interval_over_clips_and_one_without_value_the_reason():
@@ -127,6 +127,17 @@ def test_a_cell_without_repetitions_has_the_interval_over_clips_and_one_without_
     assert cell(line, results(static=missing), FID) == "N too small"
     assert cell(line, results(static={"empty": "not trained"}), FID) == "not trained"
     assert cell(line, results(), FID) == "not measured"
+
+
+def test_hidden_metrics_have_no_column_and_the_processor_time_is_in_the_first_table():
+    table, content = PaperTable("table1", "study"), results()
+    whole, short = table.markdown(content), table.markdown(content, [ACCURACY.name])
+    assert "| MDM | 0.600" in whole
+    assert "0.600" not in short
+    assert whole.count("processor minutes, training") == 1
+    reason = "They cannot be compared"
+    assert reason in whole
+    assert reason not in table.markdown(content, ["texts"])
 
 
 @pytest.mark.parametrize(
