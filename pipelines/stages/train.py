@@ -33,7 +33,7 @@ class TrainParams:
     ours: Mapping[str, Any]
     small: Mapping[str, Any]
     full: Mapping[str, Any]
-    processes: int = 1  # that train one network together; ``training.parts`` sets what each step computes
+    processes: int = 1  # that train one network together; ``training.micro_batches`` sets what each step computes
 
     def of(self, network: str) -> dict[str, Any]:
         """The settings of a network in the chosen preset and size, and the seed; the others keep their defaults."""
