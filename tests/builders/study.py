@@ -79,6 +79,10 @@ def check_soundness(truths: Sequence[TruthSequence]) -> None:
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     for truth, direction in zip(truths, directions, strict=True):
         assert is_sound(truth, pair)
+        sampled = truth.at_30_fps()
+        nearest_m = np.min([near.distance_m.min(1) for near in surface_distances(sampled, pair).values()], axis=0)
+        assert nearest_m.min() > -0.01
+        assert nearest_m[sampled.lifted].max(initial=0.0) < 0.02
         assert not is_sound(shifted(truth, np.array([0.0, 0.0, 0.2])), pair)
         for shift_m in (np.zeros(3), 0.01 * direction, np.array([0.0, 0.0, 0.3])):
             moved = shifted(truth, shift_m).at_30_fps()

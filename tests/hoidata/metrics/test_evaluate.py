@@ -33,6 +33,16 @@ def named(clip, clip_id, **changes):
     return replace(clip, clip_id=clip_id, **changes)
 
 
+def test_intervals_contain_the_value_of_their_metric(write_annotated, moved, tmp_path):
+    root, clips = write_annotated()
+    predicted = [named(moved(c, (0, 0.01 * k, 0)), f"{c.clip_id}~{k}") for c in clips.values() for k in range(3)]
+    evaluation = evaluate_store(written(tmp_path / "three", predicted), root)
+    assert set(evaluation["intervals"]) <= set(evaluation["figures"])
+    for name, ends in evaluation["intervals"].items():
+        for low, high in ends.values():
+            assert low - 1e-6 <= evaluation["figures"][name] <= high + 1e-6, name
+
+
 def test_recorded_clips_have_no_error_and_full_contact(write_annotated, tmp_path):
     root, clips = write_annotated()
     evaluation = evaluate_store(written(tmp_path / "same", clips.values()), root)

@@ -69,6 +69,16 @@ def test_equal_sets_have_no_distance_and_a_shift_counts_squared():
     assert fid_frechet(one, one + 2.0) == pytest.approx(4 * 4)
 
 
+def test_the_distance_of_halves_of_a_gaussian_shrinks_with_size_as_in_theory():
+    size, results = 8, {}
+    for rows in (64, 256, 1024):
+        draws = [fid_frechet(normal(rows, size, seed), normal(rows, size, 1000 + seed)) for seed in range(30)]
+        results[rows] = np.mean(draws)
+        # Leading order in 1 / N: 2 tr C / N of the means, D (D + 1) / 2 N of the covariances.
+        assert results[rows] == pytest.approx((2 * size + size * (size + 1) / 2) / rows, rel=0.15)
+    assert results[64] > 3 * results[256] > 9 * results[1024]
+
+
 def test_a_frechet_distance_below_four_clips_per_feature_is_refused_with_a_reason():
     assert fid_frechet(normal(31, 8), normal(64, 8)) is None
     assert fid_frechet(normal(64, 8), normal(31, 8)) is None

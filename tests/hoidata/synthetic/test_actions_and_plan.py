@@ -6,7 +6,7 @@ import pytest
 
 from hoidata.datasets.h2o.adapter import ACTIONS as H2O_LABELS
 from hoidata.synthetic.actions import ACTIONS, CASTS, H2O_ACTION_IDS, LONGEST_CLIP, MEAN_LENGTH, plan, subjects
-from hoidata.synthetic.paths import MOTIONS, follow_path
+from hoidata.synthetic.paths import MOTIONS, follow_path, minimum_jerk
 from hoidata.synthetic.sequences import sample_length
 
 DATASETS = ("h2o", "grab", "arctic")
@@ -109,3 +109,13 @@ def test_a_left_handed_path_is_the_mirror_image():
     left = follow_path(MOTIONS["pour"], frames, 5.0, 80.0, True, 1.1, 0.9)
     np.testing.assert_allclose(left.shift_m, right.shift_m * [-1, 1, 1])
     np.testing.assert_allclose(left.rotation_rad, right.rotation_rad * [1, -1, -1])
+
+
+def test_minimum_jerk_starts_and_ends_at_rest():
+    fraction = np.linspace(0, 1, 1001)
+    position = minimum_jerk(fraction)
+    velocity = np.gradient(position, fraction)
+    assert (position[0], position[-1]) == (0.0, 1.0)
+    assert abs(velocity[0]) < 1e-4
+    assert abs(velocity[-1]) < 1e-4
+    assert (velocity >= -1e-9).all()

@@ -9,10 +9,13 @@ import pytest
 import yaml
 
 from hoidata.batches.dataset import ClipSample
+from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
 from hoidata.settings import build_config
-from models.bimart.sampler import preset_of, sampling_of
-from models.bimart.scene import Scene, hand_vertices_m, recorded_clip
+from models.bimart.network import DenoiserConfig
+from models.bimart.sampler import SamplingConfig, preset_of, sampling_of
+from models.bimart.scene import FeatureConfig, Scene, hand_vertices_m, recorded_clip
+from models.bimart.training import LossConfig
 from models.common.training import TrainingSpec
 from models.registry import load_network
 from pipelines.stages.train import TrainParams
@@ -104,3 +107,17 @@ def test_the_papers_scale_leaves_a_margin_of_15_percent(samples: list[ClipSample
     # Eq. 1; the axis of a rigid object goes through its origin.
     farthest_m = np.linalg.norm(vertices_m - scene.object_from_canonical.translation, axis=1).max()
     assert scene.object_scale * farthest_m == pytest.approx(0.85)
+
+
+@pytest.mark.parametrize(
+    ("config", "old", "new"),
+    [
+        (FeatureConfig, "most_m", "max_distance_m"),
+        (DenoiserConfig, "floor", "min_std_fraction"),
+        (LossConfig, "windows", "windows_per_clip"),
+        (SamplingConfig, "guide", "contact_guidance"),
+    ],
+)
+def test_a_renamed_key_is_refused_with_its_new_name(config: type, old: str, new: str) -> None:
+    with pytest.raises(BadInput, match=f"{old} is now {new}"):
+        build_config(config, {old: 1}, "params.yaml: train")

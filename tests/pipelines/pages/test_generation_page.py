@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import re
 import subprocess
 from dataclasses import replace
 
@@ -16,6 +17,7 @@ from hoidata.objects.sampling import sample_points
 from models.text2hoi.generation import GeneratedMotion
 from pipelines.pages.examples import touched_points
 from pipelines.pages.generation_page import ARRAYS, write_generation
+from pipelines.pages.player import three_javascript
 
 TEXT = "Lift a box & hold it with the right hand."
 
@@ -52,6 +54,12 @@ def write(hands, tmp_path):
         return write_generation(tmp_path / to, motions, hands, "checkpoints/embedded/grab", ["z is <taken> for up"])
 
     return written
+
+
+def test_the_written_page_fetches_nothing(motion, write):
+    own_text = write(motion)[-1].read_text().replace(three_javascript(), "")
+    assert not re.search(r"""https?://|@import|(?:src|href|data)\s*=\s*["']?//|url\(\s*["']?//""", own_text, re.I)
+    assert "default-src 'none'" in own_text
 
 
 def test_three_files_are_written_and_repeat_byte_for_byte(motion, write):

@@ -264,6 +264,8 @@ def test_every_second_frame_of_a_recording_is_a_recording(stored):
     np.testing.assert_array_equal(few.usable, recording.usable[::2])
     np.testing.assert_array_equal(few.object.translation_m, recording.object.translation_m[::2])
     np.testing.assert_array_equal(few.state("left").tip_m, recording.state("left").tip_m[::2])
+    for side in SIDES:
+        np.testing.assert_array_equal(few.hands[side].wrist_m, recording.hands[side].wrist_m[::2])
 
 
 def test_without_the_skin_file_there_are_clips_and_no_recordings(root, tmp_path):
