@@ -34,10 +34,9 @@ FOLDER = Path(__file__).parent
 METRIC = {metric.name: metric for metric in ALL_METRICS}
 ORDERED_BY = "accuracy_top3_paper"
 STATIC = [ordering for ordering in EXPECTED_ORDERINGS if ordering.control == "static"]
-LEGEND = (
-    "±: 95 % interval over repetitions of sampling; in parentheses: over clips, of metrics measured on one repetition."
-)
-SEEDS_LEGEND = " Values and both are means over {} training seeds; the last ±: standard deviation over these seeds."
+LEGEND = "In parentheses: 95 % interval over clips. ±: "
+REPETITIONS_LEGEND = "95 % interval over repetitions of sampling, of one training; 0 for a method without randomness."
+SEEDS_LEGEND = "standard deviation over {} trainings, of which values and intervals are means."
 # ``table1.json``: by ``<run> <seed>`` the digest of its settings, processor seconds by stage, and metrics by method.
 Results = Mapping[str, Mapping[str, Any]]
 # By seed: ``value``, and its intervals ``repetitions`` and ``clips`` if there are any.
@@ -142,8 +141,8 @@ class PaperTable:
         hidden: titles of tables, metrics, and ``texts`` for the text that is the same for every corpus.
         """
         n_seeds = len(self.rows[0].of(results))
-        seeds_legend = SEEDS_LEGEND.format(n_seeds) if n_seeds > 1 else ""
-        parts = [] if "texts" in hidden else [f"{self.content['budget']} {LEGEND}{seeds_legend}"]
+        spread = SEEDS_LEGEND.format(n_seeds) if n_seeds > 1 else REPETITIONS_LEGEND
+        parts = [] if "texts" in hidden else [f"{self.content['budget']} {LEGEND}{spread}"]
         minutes = {line: self.minutes(line, results) for line in self.rows}
         for title, columns in self.content["columns"].items():
             if title not in hidden:
@@ -218,12 +217,14 @@ def cell(line: Row, results: Results, metric: AnyMetric) -> str:
     seeds = line.values(results, metric.name)
     if not seeds:
         return line.reason(results, metric.name).partition(":")[0]
-    text, values = number(mean_value(seeds)), {seed["value"] for seed in seeds}
-    if (half := half_width(seeds, "repetitions")) is not None:
+    text, half = number(mean_value(seeds)), half_width(seeds, "repetitions")
+    if len(seeds) > 1:
+        text += f"±{number(stdev(seed['value'] for seed in seeds))}"
+    elif half is not None:
         text += f"±{number(half)}"
-    elif ends := [seed["clips"] for seed in seeds if "clips" in seed]:
+    if ends := [seed["clips"] for seed in seeds if "clips" in seed]:
         text += " ({}–{})".format(*(number(mean(end)) for end in zip(*ends, strict=True)))
-    return text + (f"±{number(stdev(seed['value'] for seed in seeds))}" if len(values) > 1 else "")
+    return text
 
 
 def difference(metric: AnyMetric, seeds: Seeds, others: Seeds, recorded: Seeds) -> str:

@@ -113,17 +113,22 @@ def results(**methods: dict) -> dict:
     }
 
 
-def test_a_cell_has_the_mean_the_interval_over_repetitions_and_the_spread_over_seeds():
-    half = 4.302653 * 0.1 / 3**0.5  # Student's t for three repetitions, standard deviation .1
+def test_a_cell_has_the_mean_the_spread_over_seeds_and_the_interval_over_clips():
     text = cell(Row("MDM", "ours", "mdm"), results(), ACCURACY)
-    assert text == f"0.600±{half:.3f}±{stdev([0.5, 0.7]):.3f}"
+    assert text == f"0.600±{stdev([0.5, 0.7]):.3f} (0.100–0.900)"
+
+
+def test_a_cell_of_one_training_has_the_interval_over_repetitions():
+    half = 4.302653 * 0.1 / 3**0.5  # Student's t for three repetitions, standard deviation .1
+    one = {"ours 0": results()["ours 0"]}
+    assert cell(Row("MDM", "ours", "mdm"), one, ACCURACY) == f"0.500±{half:.3f} (0.100–0.900)"
 
 
 def test_a_cell_without_repetitions_has_the_interval_over_clips_and_one_without_value_the_reason():
     single = {"figures": {FID.name: 2.0}, "intervals": {FID.name: {"clips": [1.0, 3.0]}}}
     missing = {"figures": {}, "intervals": {}, "notes": {FID.name: "N too small"}}
     line = Row("static", "ours", "static")
-    assert cell(line, results(static=single), FID) == "2.00 (1.00–3.00)"
+    assert cell(line, results(static=single), FID) == "2.00±0.00 (1.00–3.00)"
     assert cell(line, results(static=missing), FID) == "N too small"
     assert cell(line, results(static={"empty": "not trained"}), FID) == "not trained"
     assert cell(line, results(), FID) == "not measured"
@@ -162,7 +167,7 @@ def test_the_command_fails_if_the_static_control_is_as_good_as_the_recordings(
     assert make("table1", "embedded") == code
     assert ("static does not fall in accuracy_top1_paper" in capsys.readouterr().err) == bool(code)
     text = (tmp_path / "table1.md").read_text()
-    assert "| MDM | 0.600±0.248" in text
+    assert "| MDM | 0.600±0.141" in text
     assert "| Text2HOI | 0.9218 |" in text
 
 

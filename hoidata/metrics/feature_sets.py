@@ -157,8 +157,12 @@ def fid_paired(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def has_enough_rows(features: np.ndarray) -> bool:
-    """Whether there are at least 4 rows per feature: below, two samples of one distribution seem far apart."""
-    return len(features) >= ROWS_PER_FEATURE * features.shape[1]
+    """Whether there are at least 4 different rows per feature: below, two samples of one distribution seem far apart.
+
+    Copies, such as repetitions of a method without randomness, add nothing to a covariance.
+    """
+    enough = ROWS_PER_FEATURE * features.shape[1]
+    return len(features) >= enough and len(np.unique(features, axis=0)) >= enough
 
 
 def fid_frechet(one: np.ndarray, other: np.ndarray) -> float | None:

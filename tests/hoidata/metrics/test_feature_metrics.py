@@ -89,6 +89,13 @@ def test_a_frechet_distance_below_four_clips_per_feature_is_refused_with_a_reaso
         assert (results[name].value, results[name].note) == (None, TOO_SMALL)
 
 
+def test_equal_repetitions_do_not_make_a_set_large_enough():
+    few, many = normal(20, 8), encoded(normal(200, 8))
+    copies = encoded(np.tile(few, (4, 1)), samples=4)
+    result = measured_features(copies, encoded(few), many)["fid_frechet_train_corrected"]
+    assert (result.value, result.note) == (None, TOO_SMALL)
+
+
 def test_repetitions_of_few_clips_are_pooled_against_the_training_clips():
     few, many = encoded(normal(40, 4), samples=4), encoded(normal(200, 4))
     results = measured_features(few, encoded(normal(10, 4)), many)["fid_frechet_train_corrected"]
