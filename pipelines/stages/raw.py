@@ -44,7 +44,7 @@ def recipe_digest(manifest: Manifest) -> str:
 def write_generated(paths: StagePaths, manifest: Manifest, root: Path) -> None:
     """Write the corpus of the manifest's recipe into ``root``, completely or not at all.
 
-    The file ``<root>.recipe`` beside it marks it as generated, for ``convert`` and ``adapters check``.
+    The file ``<root>.recipe`` next to it marks it as generated, for ``convert`` and ``adapters check``.
     """
     from hoidata.synthetic.corpus import write_corpus
 
