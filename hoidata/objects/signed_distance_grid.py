@@ -32,7 +32,7 @@ class DistanceFields:
         """Compute the grids of (key, model) pairs with ``resolution`` nodes along each axis."""
         self.resolution = resolution
         self.row: dict[str, int] = {}
-        values, low, high, axis, origin, slide = [], [], [], [], [], []
+        values, low, high, axis, origin, slide, has_lid = [], [], [], [], [], [], []
         for key, model in objects:
             if key in self.row:
                 continue
@@ -43,7 +43,10 @@ class DistanceFields:
             for stack, vector in zip((axis, slide), joint_vectors(model), strict=True):
                 stack.append(vector)
             origin.append(np.zeros(3) if model.hinge is None else model.hinge.origin_m)
+            has_lid.append(1 in model.parts)
         self.values = torch.from_numpy(np.concatenate(values))
+        self.distances = self.values[:, :1].contiguous()
+        self.has_lid = torch.tensor(has_lid)  # stays on the CPU
         self.low, self.high = _tensor(low).reshape(-1, 2, 3), _tensor(high).reshape(-1, 2, 3)
         self.axis, self.origin, self.slide_m = _tensor(axis), _tensor(origin), _tensor(slide)
 
@@ -53,7 +56,7 @@ class DistanceFields:
 
     def to(self, device: torch.device | str) -> "DistanceFields":
         """Move the grids to a device. Returns self."""
-        for name in ("values", "low", "high", "axis", "origin", "slide_m"):
+        for name in ("values", "distances", "low", "high", "axis", "origin", "slide_m"):
             setattr(self, name, getattr(self, name).to(device))
         return self
 
@@ -63,18 +66,30 @@ class DistanceFields:
         rows: (B,) indices of objects. points_m: (B, F, P, 3). hinge_rad: (B, F) ``ObjectTrack.joint_angle_rad``.
         Returns distances (B, F, P) and offsets (B, F, P, 3), metres.
         """
-        rows = send(rows, points_m.device)
-        rotation = rotvec_to_rotmat(self.axis[rows][:, None] * hinge_rad[..., None])
-        origin = self.origin[rows][:, None, None]
-        base = self._read(rows, 0, points_m)
-        slid_m = (self.slide_m[rows][:, None] * hinge_rad[..., None])[..., None, :]
-        lid = self._read(rows, 1, (points_m - origin - slid_m) @ rotation + origin)
-        lid = torch.cat((lid[..., :1], lid[..., 1:] @ rotation.transpose(-1, -2)), -1)
-        nearest = torch.where(base[..., :1] <= lid[..., :1], base, lid)
+        nearest = self._nearest(self.values, rows, points_m, hinge_rad)
         return nearest[..., 0], nearest[..., 1:]
 
-    def _read(self, rows: Tensor, part: int, points: Tensor) -> Tensor:
-        """(B, F, P, 4) interpolated values of one part at points (B, F, P, 3) of its rest frame."""
+    def distance(self, rows: Tensor, points_m: Tensor, hinge_rad: Tensor) -> Tensor:
+        """The distances of ``query``, computed without the offsets."""
+        return self._nearest(self.distances, rows, points_m, hinge_rad)[..., 0]
+
+    def _nearest(self, values: Tensor, rows: Tensor, points_m: Tensor, hinge_rad: Tensor) -> Tensor:
+        """(B, F, P, C) interpolated ``values`` (node, C) of the nearer part, vectors in the object frame."""
+        only_base = not self.has_lid[rows.cpu()].any()
+        rows = send(rows, points_m.device)
+        base = self._read(values, rows, 0, points_m)
+        if only_base:
+            return base
+        rotation = rotvec_to_rotmat(self.axis[rows][:, None] * hinge_rad[..., None])
+        origin = self.origin[rows][:, None, None]
+        slid_m = (self.slide_m[rows][:, None] * hinge_rad[..., None])[..., None, :]
+        lid = self._read(values, rows, 1, (points_m - origin - slid_m) @ rotation + origin)
+        if lid.shape[-1] > 1:
+            lid = torch.cat((lid[..., :1], lid[..., 1:] @ rotation.transpose(-1, -2)), -1)
+        return torch.where(base[..., :1] <= lid[..., :1], base, lid)
+
+    def _read(self, values: Tensor, rows: Tensor, part: int, points: Tensor) -> Tensor:
+        """(B, F, P, C) interpolated ``values`` of one part at points (B, F, P, 3) of its rest frame."""
         low, high = self.low[rows, part][:, None, None], self.high[rows, part][:, None, None]
         inside = torch.minimum(torch.maximum(points, low), high)
         outside_m = points - inside
@@ -86,8 +101,10 @@ class DistanceFields:
         first = (
             (x * self.resolution + y) * self.resolution + z + ((rows * 2 + part) * self.resolution**3)[:, None, None]
         )
-        total = _blend(self.values, first, weight, (self.resolution**2, self.resolution, 1))
+        total = _blend(values, first, weight, (self.resolution**2, self.resolution, 1))
         distance = total[..., 0] + (outside_m.square().sum(-1) + 1e-12).sqrt() - 1e-6
+        if total.shape[-1] == 1:
+            return distance[..., None]
         return torch.cat((distance[..., None], total[..., 1:] - outside_m), -1)
 
 

@@ -197,10 +197,20 @@ class Surface:
         Returns the points in the object's frame (B, 2, F, P, 3), their signed distance (B, 2, F, P) to its surface, and
         the offset (B, 2, F, P, 3) to the nearest surface point, all in metres.
         """
-        local = to_object_frame(points_m, objects[:, None])
-        field_index = self.fields.rows([model.name for model in batch.objects])
-        hinge = objects[..., OBJECT_HINGE] * batch.articulated[:, None]
-        both_sides = local.transpose(1, 2).flatten(2, 3)
-        distance, offset = self.fields.query(field_index, both_sides, hinge)
+        local, *query = self._query(batch, points_m, objects)
+        distance, offset = self.fields.query(*query)
         shape = (len(local), local.shape[2], 2, local.shape[3])
         return local, distance.reshape(shape).transpose(1, 2), offset.reshape(*shape, 3).transpose(1, 2)
+
+    def distance(self, batch: RequestBatch, points_m: Tensor, objects: Tensor) -> Tensor:
+        """The distances of ``measure``, computed without the offsets."""
+        local, *query = self._query(batch, points_m, objects)
+        shape = (len(local), local.shape[2], 2, local.shape[3])
+        return self.fields.distance(*query).reshape(shape).transpose(1, 2)
+
+    def _query(self, batch: RequestBatch, points_m: Tensor, objects: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Points in the object's frame (B, 2, F, P, 3), and the arguments of ``DistanceFields.query``."""
+        local = to_object_frame(points_m, objects[:, None])
+        rows = self.fields.rows([model.name for model in batch.objects])
+        hinge = objects[..., OBJECT_HINGE] * batch.articulated[:, None]
+        return local, rows, local.transpose(1, 2).flatten(2, 3), hinge

@@ -135,7 +135,7 @@ class RefinerObjective:
         """Signed distances of some vertices (B, 2, K, V) and the joints (B, 2, K, 21) of hands in the chosen frames."""
         vertices, joints = self.surface.hands.vertices(hands, batch.betas, batch.template_m)
         points = torch.cat((vertices[..., self.vertices, :], joints), -2)
-        _, distance, _ = self.surface.measure(batch, points, losses.take_frames(objects, chosen, 1))
+        distance = self.surface.distance(batch, points, losses.take_frames(objects, chosen, 1))
         vertex_distance, joint_distance = distance.split([len(self.vertices), joints.shape[-2]], -1)
         return vertex_distance, joint_distance
 
@@ -164,7 +164,7 @@ class RefinerObjective:
             hands, objects, contact_map = self._generate(batch, random)
             coarse = self.surface.coarse(batch, hands, objects, contact_map, batch.present)
             target = self.network.in_view(batch.hands, batch.object).transpose(1, 2)
-            true_distance = self.surface.measure(batch, batch.joints_m, batch.object)[1].transpose(1, 2)
+            true_distance = self.surface.distance(batch, batch.joints_m, batch.object).transpose(1, 2)
             view = {name: getattr(coarse, name).transpose(1, 2) for name in PER_HAND} | {"object": objects}
             for position, index in enumerate(indices):
                 stop = samples[index].length

@@ -10,6 +10,7 @@ from hoidata.objects.surface_index import surface_index
 from hoidata.synthetic.hand_capsules import grid_field
 from hoidata.synthetic.shapes import sphere
 from tests.builders.objects import igl_signed_m
+from tests.hoidata.objects.test_hinge_cut import divided_cube
 
 
 def test_both_look_ups_give_the_exact_signed_distance_to_a_fraction_of_a_cell():
@@ -44,3 +45,27 @@ def test_beyond_the_grid_the_torch_look_up_goes_on_and_the_search_s_stays_below(
     np.testing.assert_allclose(distance, [[[0.25]]], atol=1e-3)
     np.testing.assert_allclose(offset, [[[[-0.25, 0, 0]]]], atol=1e-3)
     assert 0.2 < grid_field(surface_index(model).filled[0])(np.array([[0.3, 0.0, 0.0]]))[0] <= 0.251
+
+
+def test_distances_alone_and_beside_a_hinged_object_are_those_of_the_query():
+    vertices, faces = sphere(0.05, 40)
+    ball = ObjectModel("ball", vertices, faces, np.zeros(len(vertices), np.uint8))
+    fields = DistanceFields([("ball", ball), ("cube", divided_cube())], 24)
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-0.09, 0.09, (2, 3, 50, 3)).astype(np.float32))
+    angle = torch.full((2, 3), 0.4)
+
+    def measured(rows: list[int], function, chosen: slice = slice(None)) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distances, and the gradient of their sum of squares."""
+        places = points[chosen].clone().requires_grad_()
+        distance = function(torch.tensor(rows), places, angle[chosen])
+        return distance.detach(), torch.autograd.grad(distance.square().sum(), places)[0]
+
+    both = measured([0, 1], lambda *query: fields.query(*query)[0])
+    only = measured([0, 1], fields.distance)
+    alone = measured([0], fields.distance, slice(1))
+    moved = measured([0, 1], lambda rows, places, angles: fields.distance(rows, places, 0 * angles))
+    for whole, distances, of_ball in zip(both, only, alone, strict=True):
+        assert torch.equal(whole, distances)
+        assert torch.equal(whole[:1], of_ball)
+    assert torch.equal(moved[0][0], only[0][0])
+    assert not torch.allclose(moved[0][1], only[0][1])
