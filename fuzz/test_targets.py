@@ -1,14 +1,18 @@
 """Seeds are valid files, faults are detected, and a short run finds no fault."""
 
+import io
+import pickle
+import random
 import subprocess
 import sys
 import time
 import warnings
+import zipfile
 from pathlib import Path
 
 import pytest
 
-from fuzz.engine import Target, check_call
+from fuzz.engine import Target, change_pickle, change_zip, check_call
 from fuzz.targets import all_targets
 from hoidata.errors import BadInput, HoidataError
 
@@ -100,3 +104,18 @@ def test_every_parser_of_files_from_outside_is_a_target():
         "hot3d-tables", "hot3d-tar", "hot3d-json", "oakink2-annotation", "oakink2-json", "object-keyframes",
         "manipnet-hand-reference", "manifest", "hoidata-toml", "params-yaml", "store-info",
     }  # fmt: skip
+
+
+def test_changed_containers_are_sound_and_follow_the_seed(monkeypatch):
+    monkeypatch.setattr("fuzz.engine.atheris.Mutate", lambda content, longest: content[::-1])
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name in ("a.npy", "b.npy"):
+            archive.writestr(zipfile.ZipInfo(name), f"content of {name}")
+    for change, data in ((change_zip, stream.getvalue()), (change_pickle, pickle.dumps([1, "a", {"b": 2.5}], 4))):
+        first, again = ([change(random.Random(seed), data, 1 << 14) for seed in range(60)] for _ in range(2))
+        assert first == again
+        assert len(set(first)) > 5
+        for changed in first if change is change_zip else ():
+            with zipfile.ZipFile(io.BytesIO(changed)) as archive:
+                assert archive.testzip() is None

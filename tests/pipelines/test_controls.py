@@ -119,6 +119,8 @@ METHODS = {
         ("blind", "contact_f1", "fall", True),
         ("half-blind", "contact_f1", "fall", False),  # within the truth's interval
         ("blind", "contact_f1", "rise", False),
+        ("half-blind", "contact_f1", "stay", True),
+        ("blind", "contact_f1", "stay", False),
         ("half-blind", "fid", "be equal", True),
         ("blind", "fid", "be equal", False),
         ("blind", "fid", "be zero", False),

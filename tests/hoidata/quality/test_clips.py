@@ -300,3 +300,11 @@ def test_each_parts_pose_carries_its_points_through_the_world(make_clip):
     for part, rows in enumerate((~moved, moved)):
         placed = facts.points_m[rows] @ motion.rotmats[part].transpose(0, 2, 1) + motion.positions_m[part][:, None]
         np.testing.assert_allclose(placed, motion.points_m[:, rows], atol=1e-9)
+
+
+def test_frames_deeper_than_a_centimetre_are_too_deep(good, monkeypatch):
+    depth_m = {"left": np.repeat([0.003, 0.011, 0.003], 4), "right": np.repeat([0.0, 0.0, 0.0099], 4)}
+    monkeypatch.setattr("hoidata.quality.measures.hand_in_object_frame", lambda clip, side, hands: side)
+    monkeypatch.setattr("hoidata.quality.measures.deepest_m", lambda side, index: depth_m[side])
+    shares = [row(good, Thresholds(**one))["penetration_share"] for one in ({}, {"too_deep_m": 0.005})]
+    assert shares == pytest.approx([4 / 12, 8 / 12])

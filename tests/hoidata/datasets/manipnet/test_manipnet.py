@@ -337,3 +337,23 @@ def test_a_reference_without_104_vertices_of_the_skin_is_refused(root, tmp_path,
     path.write_text(json.dumps(json.loads(path.read_text()) | {"proximity_vertices": sensors}))
     with pytest.raises(BadInput, match=r"hand_reference\.json"):
         read_hand_recording(RawTree(tmp_path), KEY)
+
+
+@pytest.mark.parametrize(
+    "wrong", [None, {"radius": -1.0}, {"radius": float("nan")}, {"joint": "ELBOW"}, {"start_local": [0, 0]}]
+)
+def test_a_reference_without_19_sound_capsules_is_refused(root, tmp_path, wrong):
+    shutil.copytree(root, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "hand/hand_reference.json"
+    reference = json.loads(path.read_text())
+    first, *others = reference["capsules"]
+    capsules = others if wrong is None else [first | wrong, *others]
+    path.write_text(json.dumps(reference | {"capsules": capsules}))
+    with pytest.raises(BadInput, match=r"hand_reference\.json"):
+        read_hand_recording(RawTree(tmp_path), KEY)
+
+
+def test_capsule_radii_are_metres(root, stored):
+    capsules = json.loads((root / "hand/hand_reference.json").read_text())["capsules"]
+    radius_m = [capsule["radius"] / 10 for capsule in capsules]
+    np.testing.assert_allclose(stored.recording(KEY.name).hand.capsules.radius_m, radius_m)

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.datasets.manipnet.hand import parse_bvh, unpack_text
-from hoidata.datasets.manipnet.segments import BodyMotion, find_cuts, interactions, motion_verb
+from hoidata.datasets.manipnet.segments import BodyMotion, find_cuts, height_above_table, interactions, motion_verb
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import Interval, widened
 
@@ -248,3 +248,8 @@ def test_a_margin_adds_as_many_usable_frames_on_both_sides(margin, expected):
     usable = np.ones(30, dtype=bool)
     usable[[1, 28]] = False
     assert tuple(widened(Interval(10, 20), margin, usable)) == expected
+
+
+def test_a_few_frames_below_the_table_do_not_move_it():
+    lowest_m = np.repeat([-0.5, 0.1, 0.4], [2, 38, 60])
+    np.testing.assert_allclose(height_above_table(lowest_m)[[2, -1]], [0.0, 0.3], atol=1e-12)
