@@ -260,19 +260,13 @@ def training_actions(annotated: AnnotatedStore) -> Actions:
     """Compute the actions of a dataset from its training clips and ``actions.toml``."""
     numbers: dict[str, list[dict[str, float]]] = {}
     for clip_id in annotated.ids("train"):
-        if verb := verb_of(annotated, clip_id):
+        if verb := annotated.verb(clip_id):
             clip = annotated.store.clip(clip_id, motion_only=True)
             near = annotated.distances(clip_id)
             touching = np.zeros((len(SIDES), clip.n_frames), bool)
             touching[near.side, near.frame] = True
             numbers.setdefault(verb, []).append(action_numbers(clip.object, clip.gravity, touching))
     return learn_actions(numbers, written_limits())
-
-
-def verb_of(annotated: AnnotatedStore, clip_id: str) -> str | None:
-    """Return the annotated verb of a clip."""
-    verb = annotated.hand_types.at[clip_id, "verb"]
-    return verb if isinstance(verb, str) and verb else None
 
 
 def learn_actions(

@@ -177,7 +177,7 @@ def load_sample(annotated: AnnotatedStore, clip_id: str) -> ClipSample:
     return ClipSample(
         clip_id=clip_id,
         dataset=clip.dataset,
-        verb=clip.verb,
+        verb=annotated.verb(clip_id),
         object_words=clip.object_words,
         object_key=annotated.object_key(clip_id),
         object_model=clip.object.model,

@@ -10,7 +10,6 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from hoidata.actions.action import verb_of
 from hoidata.clips.clip import SIDES, Side
 from hoidata.metrics.pair import Motion, acting_sides
 from hoidata.store.annotated import AnnotatedStore
@@ -126,7 +125,7 @@ def _encoded(
     ids: Sequence[str],
 ) -> EncodedSet:
     sequences = annotated.store.sequences.loc[list(ids)]
-    verbs, hands = [verb_of(annotated, clip_id) for clip_id in ids], [annotated.hand_type(clip_id) for clip_id in ids]
+    verbs, hands = [annotated.verb(clip_id) for clip_id in ids], [annotated.hand_type(clip_id) for clip_id in ids]
     prompt = [" | ".join(map(str, words)) for words in zip(verbs, sequences["object_words"], hands, strict=True)]
     label = [encoder.labels.index(verb) if verb in encoder.labels else UNKNOWN for verb in verbs]
     text = encoder.encode_text(np.stack([annotated.text_embedding(clip_id)[0] for clip_id in ids]))

@@ -22,7 +22,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from hoidata.actions.action import Actions, training_actions, verb_of
+from hoidata.actions.action import Actions, training_actions
 from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.errors import BadInput
@@ -333,7 +333,7 @@ class _Evaluator:
             part=points.part,
             threshold_m=annotated.contact_threshold_m,
             table_m=None if motion.clip.gravity is None else object_scene(motion.clip).table_height_m,
-            verb=verb_of(annotated, clip_id),
+            verb=annotated.verb(clip_id),
         )
 
 

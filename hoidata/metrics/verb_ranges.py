@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hoidata.actions.action import Actions, action_numbers, training_actions, usual_limits, verb_of
+from hoidata.actions.action import Actions, action_numbers, training_actions, usual_limits
 from hoidata.batches.requests import ObjectPoints
 from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack
 from hoidata.clips.slip import joint_slips_cm_s, touched_parts
@@ -76,7 +76,7 @@ def training_ranges(store: AnnotatedStore) -> Actions:
     for clip_id in store.ids("train"):
         clip = store.clip(clip_id)
         speeds += [fastest_joint(store.joints(clip_id, side), clip.hands[side].valid) for side in SIDES]
-        if verb := verb_of(store, clip_id):
+        if verb := store.verb(clip_id):
             slips.setdefault(verb, []).append({SLIP: _recorded_slip_cm_s(store, clip_id, clip.object)})
     all_slips = [measures[SLIP] for clips in slips.values() for measures in clips]
     scale = {SLIP: (0.0, max(float(np.std(all_slips)), LEAST_DEVIATION_CM_S))} if all_slips else {}

@@ -131,6 +131,11 @@ class AnnotatedStore:
             raise KeyError(f"no active hand in {clip_id}: {self.hand_types.at[clip_id, 'reason']}")
         return hand_type
 
+    def verb(self, clip_id: str) -> str | None:
+        """The annotated verb of a clip: the label of the source, else derived from the motion; None without either."""
+        verb = self.hand_types.at[clip_id, "verb"]
+        return verb if isinstance(verb, str) and verb else None
+
     def hand_evidence(self, clip_id: str, threshold_m: float | None = None) -> HandEvidence:
         """Read the distance of each hand in each frame, and the hand type at ``threshold_m``, by default annotate's.
 

@@ -79,8 +79,7 @@ class Prompt:
         return sorted(others, key=lambda index: -overlap[index])
 
     def _of(self, request: Request) -> tuple[str | None, str]:
-        sequence = self.annotated.store.sequences.loc[request.clip_id]
-        return sequence["verb"], str(sequence["object"])
+        return self.annotated.verb(request.clip_id), self.annotated.object_key(request.clip_id)
 
 
 def by_sentence(train: Train, request: Request) -> np.ndarray:

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from hoidata.actions.action import verb_of
 from hoidata.clips.clip import SIDES, Side
 from hoidata.clips.features import OBJECT_ROTATION_6D, object_features, upright
 from hoidata.files import canonical_json
@@ -102,7 +101,7 @@ class Examples:
     @classmethod
     def of(cls, annotated: AnnotatedStore, split: str, joints_only: bool = False) -> "Examples":
         """The clips of a part that have a verb; joints_only: without ``steps``, which take longest to compute."""
-        verbs = {clip_id: verb_of(annotated, clip_id) for clip_id in annotated.ids(split)}
+        verbs = {clip_id: annotated.verb(clip_id) for clip_id in annotated.ids(split)}
         ids = [clip_id for clip_id, verb in verbs.items() if verb]
         recordings = list(recorded_motions(annotated, ids))
         text = [annotated.text_embedding(clip_id) for clip_id in ids]

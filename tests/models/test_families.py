@@ -19,14 +19,17 @@ from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.metrics.target_contact import read_target_contact
 from hoidata.metrics.verb_ranges import VerbRanges
 from hoidata.refinement import refine_grasps
-from hoidata.store.annotated import AnnotatedStore
+from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.store import open_store
+from models.baselines.retrieval import Prompt
 from models.common.family import Sources, motion_clip
 from models.common.predicting import PredictionConfig, requests_for, sample_family, spread
 from models.registry import family_names, load_family, load_network
 from models.text2hoi.contact_training import best_threshold, mean_f1
 from models.text2hoi.family import mean_map_by_position, other_prompts
 from models.text2hoi.sampler import Text2Hoi
+from tests.builders.clips import build_clip
+from tests.builders.stores import write_annotated
 from tests.models.toy import FAST
 
 HANDS = load_embedded_hands()
@@ -146,6 +149,25 @@ def test_retrieval_skips_clips_with_an_untracked_acting_hand(name, sources: Sour
     monkeypatch.setattr(Sources, "clips", lambda *_: [replace(both, valid=both.valid & gap), idle])
     lookup = load_family(name).load(sources)
     assert [sample.clip_id for sample in lookup.train] == [right.clip_id]
+
+
+def test_verbs_derived_from_motion_reach_samples_and_retrieval(tmp_path: Path) -> None:
+    clips = [
+        build_clip(20, seed=seed, clip_id=f"toy/{subject}/{seed}", subject=subject, verb=None)
+        for seed, subject in enumerate(("s1", "s1", "s1", "s2", "s3"))
+    ]
+    write_annotated(tmp_path, clips)
+    annotated = load_annotated(tmp_path)
+    assert set(annotated.hand_types["verb_source"]) == {"derived"}
+    train, (test,) = samples_of(annotated, "train"), samples_of(annotated, "test")
+    assert [one.verb for one in (*train, test)] == [annotated.verb(one.clip_id) for one in (*train, test)]
+    (request,) = requests_for(test, PredictionConfig(samples=1))
+    assert request.sentence is not None
+    assert request.sentence.verb == test.verb is not None
+    prompt = Prompt(annotated)
+    with_verb = {index for index, one in enumerate(train) if one.verb == test.verb and one.hand_type == test.hand_type}
+    assert set(prompt.same_verb(train, request)) == with_verb != set()
+    assert set(prompt.other_verb(train, request)).isdisjoint(with_verb)
 
 
 def test_another_prompt_always_differs(sources: Sources) -> None:

@@ -141,7 +141,7 @@ def test_hands_that_slide_more_than_in_training_clips_of_the_verb_are_unusual(
         assert strict.violations(verb, slides)["slip_cm_s"] == pytest.approx(2)
     monkeypatch.setattr("hoidata.metrics.verb_ranges.joint_slips_cm_s", lambda *arguments: np.zeros(0))
     assert {limits["slip_cm_s"][1] for limits in training_ranges(annotated).usual.values()} == {0.025}
-    monkeypatch.setattr("hoidata.actions.action.verb_of", lambda store, clip_id: None)
+    monkeypatch.setattr(type(annotated), "verb", lambda store, clip_id: None)
     assert training_ranges(annotated).usual == {}
 
 

@@ -50,6 +50,9 @@ class Clips:
     def hand_type(self, clip_id: str) -> str:
         return "right"
 
+    def verb(self, clip_id: str) -> str | None:
+        return self.clips[clip_id].verb
+
     def sentences(self, clip_id: str) -> list[str]:
         return ["a", "b", "c", "d"]
 
