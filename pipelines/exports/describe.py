@@ -19,7 +19,7 @@ from hoidata.store.fields import STORE_FILES, StoreFile
 from hoidata.store.info import embedded_hand_warning
 from hoidata.store.store import Store
 from pipelines.exports.licences import OWN_USE, ArrayLicence, licences_of
-from pipelines.exports.motion import Format, write_json
+from pipelines.exports.motion import Format, verbs_of, write_json
 
 _MARKUP = re.compile(r"[\\`*_\[\]|~$]")
 CROISSANT = "http://mlcommons.org/croissant/1.1"
@@ -154,7 +154,7 @@ def _responsible(store: Store, form: Format) -> dict[str, Any]:
     """The responsible-AI terms of Croissant that the facts of a store provide."""
     info, counts, rows = store.info, store.info["counts"], store.sequences
     errors_m = rows["fit_error_m"].dropna().tolist()  # of hands fitted to keypoints
-    verbs = Counter(rows["verb"].dropna().tolist())
+    verbs = Counter(verbs_of(store).values())
     verbs_by_count = sorted(verbs.items(), key=lambda pair: (-pair[1], str(pair[0])))
     limits = [f"gravity: {info['frame']['gravity']}"]
     if errors_m:
@@ -174,7 +174,10 @@ def _responsible(store: Store, form: Format) -> dict[str, Any]:
             f"hands: {info['hand_convention']['note']}; stored with absolute angles, hand model "
             f"{info['hand_model']['name']}",
         ],
-        "dataAnnotationProtocol": "verbs and objects as labelled by the source; sentences from rules applied to them",
+        "dataAnnotationProtocol": (
+            "verbs and objects as labelled by the source, verbs without a label derived from motion; sentences from "
+            "rules applied to them"
+        ),
         "dataBiases": [
             f"{rows['subject'].nunique()} subjects, {counts['objects']} objects, {len(verbs)} verbs; most frequent: "
             + ", ".join(f"{verb} ({count})" for verb, count in verbs_by_count[:3])

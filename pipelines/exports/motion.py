@@ -198,12 +198,13 @@ class Source:
         root = store.folder.parent
         self._sentences = _grouped(root / "annotation" / "text.parquet", "sentence")
         self._subsets = _grouped(root / "splits" / "splits.parquet", "split")
+        self._verbs = verbs_of(store)
         # Clips of a subset follow each other, in the order of the store.
         self.ids = sorted(clip_ids or store.ids, key=lambda clip_id: [*SUBSETS, ""].index(self._subset(clip_id)))
 
     def clip(self, clip_id: str) -> ExportedClip:
         """One clip with its joints and sentences."""
-        clip = self.store.clip(clip_id, motion_only=True)
+        clip = replace(self.store.clip(clip_id, motion_only=True), verb=self._verbs.get(clip_id))
         hands, joints = dict(clip.hands), {}
         for side in SIDES:
             hands[side], joints[side] = _filled_untracked(hands[side], self.store.joints(clip_id, side))
@@ -214,6 +215,13 @@ class Source:
     def _subset(self, clip_id: str) -> str:
         subset = self._subsets.get(clip_id, [None])[0]
         return subset if subset in SUBSETS else ""
+
+
+def verbs_of(store: Store) -> dict[str, str]:
+    """The verbs of the clips that have one: annotated ones, which may be derived from motion, else the source's."""
+    annotated = _grouped(store.folder.parent / "annotation" / "hand_type.parquet", "verb")
+    labels = store.sequences["verb"].to_dict() | {clip_id: verbs[0] for clip_id, verbs in annotated.items()}
+    return {clip_id: verb for clip_id, verb in labels.items() if isinstance(verb, str) and verb}
 
 
 def _grouped(path: Path, column: str) -> dict[str, list[Any]]:

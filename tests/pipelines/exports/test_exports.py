@@ -16,14 +16,16 @@ from typer.testing import CliRunner
 from hoidata.clips import SIDES
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
+from hoidata.store.annotated import load_annotated
 from hoidata.store.fields import STORE_FILES, TABLES
 from hoidata.store.info import generated_info
 from hoidata.store.store import Store, open_store, write_store
 from pipelines.cli import app
 from pipelines.exports.export import FORMATS, export_store
 from pipelines.exports.licences import KINDS, MANO, licences_of, spdx_of
+from pipelines.exports.motion import Source, verbs_of
 from tests.builders.clips import build_clip, with_hand
-from tests.builders.stores import write_annotated
+from tests.builders.stores import write_annotated, write_clips
 from tests.pipelines.exports import readers
 
 pytestmark = pytest.mark.slow
@@ -65,6 +67,17 @@ def test_joints_and_object_pose_are_read_back_from_all_formats(name, store, expo
         corner = np.array([0.1, -0.1, 0.1])
         expected = Rotation.from_rotvec(track.rotvec).apply(corner) + track.translation_m
         assert np.abs(world_from_object[:, :3, :3] @ corner + world_from_object[:, :3, 3] - expected).max() <= TOLERANCE
+
+
+def test_a_verb_that_the_source_does_not_name_is_the_one_derived_from_motion(tmp_path):
+    clips = [build_clip(6, seed=1, clip_id=f"toy/s1/{number}", verb=verb) for number, verb in enumerate((None, "open"))]
+    plain = open_store(write_clips(tmp_path / "plain", clips))
+    assert verbs_of(plain) == {"toy/s1/1": "open"}
+    annotated = open_store(write_annotated(tmp_path / "annotated", clips, points=64) / "clips")
+    derived, label = (Source(annotated).clip(clip.clip_id).facts["verb"] for clip in clips)
+    assert label == "open"
+    assert derived == load_annotated(tmp_path / "annotated").verb("toy/s1/0")
+    assert derived is not None
 
 
 def test_spider_gets_tips_and_object_with_z_up_and_skips_unsupported_clips(store, exported):
