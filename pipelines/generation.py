@@ -98,9 +98,7 @@ def generate_files(request: GenerationRequest, out: Path, store: Path | None = N
     notes += _missing_hinge_notes(verb, request.object, model)
     generator = _generator(models, replace(models.sampling, **request.sampling))
     generator = replace(generator, model=generator.model.with_sampler(**request.sampler))
-    ups = generator.object_ups
-    in_training = user is None and (not ups or model.name in ups)
-    motions = generator.generate(wording.text, model, request.options, noun if user else None, in_training)
+    motions = generator.generate(wording.text, model, request.options, noun if user else None, as_stored=user is None)
     evidence, hand = motions[0].evidence, motions[0].evidence["hand"]
     if hand["source"] != "rule":
         notes.append(f"hand: {hand['hand']}, since {hand['evidence']} (--hand chooses another)")
@@ -141,7 +139,8 @@ def _preset_notes(checkpoints: Path, networks: Sequence[str]) -> list[str]:
 
 def _missing_hinge_notes(verb: str | None, object: str | Path, model: ObjectModel) -> list[str]:
     """A note for a verb that turns a hinge and an object without one, with the remedy."""
-    lowest_deg, highest_deg = written_limits().get(verb or "", {}).get("hinge_net_deg", (0.0, 0.0))
+    first_verb = (verb or "").partition(" and ")[0]  # of "open and close"
+    lowest_deg, highest_deg = written_limits().get(first_verb, {}).get("hinge_net_deg", (0.0, 0.0))
     if model.is_articulated or lowest_deg <= 0 <= highest_deg:
         return []
     problem = f"{verb!r} turns a hinge, but the object has none"

@@ -24,6 +24,7 @@ SLIP = "slip_cm_s"
 LEAST_DEVIATION_CM_S = 0.05  # of slip, for recorded hands that never slip
 MIN_LIFT_FRACTION = 0.5  # of the checked frames in the air, in which the hands must be able to carry the object
 ACCEPTED = (2, 0.0)  # ranks that begin so need no further candidate
+ALIKE_UPS = 0.85  # length of the mean of unit vectors; 1 if all are equal
 
 
 @dataclass(frozen=True)
@@ -109,18 +110,20 @@ def fastest_joint(joints_m: np.ndarray, valid: np.ndarray) -> float:
 
 
 def object_ups(store: AnnotatedStore) -> dict[str, list[float]]:
-    """(3,) direction that is up in the first frame, object frame, by object: the mean of its training clips."""
+    """(3,) direction that is up in the first frame, object frame, by object: the mean of its training clips.
+
+    Objects that start in too different poses have none.
+    """
     ups: dict[str, list[np.ndarray]] = {}
     for clip_id in store.ids("train"):
         clip = store.store.clip(clip_id, motion_only=True)
         if clip.gravity is not None:
             ups.setdefault(clip.object.model.name, []).append(up_in_object(clip.object, clip.gravity))
     means = {name: np.mean(directions, axis=0) for name, directions in sorted(ups.items())}
-    # Objects that start in any pose have no side that is up.
     return {
         name: np.round(mean / length, 4).tolist()
         for name, mean in means.items()
-        if (length := np.linalg.norm(mean)) > 0.5
+        if (length := np.linalg.norm(mean)) > ALIKE_UPS
     }
 
 

@@ -131,20 +131,20 @@ class Generator:
         object: ObjectModel,
         options: MotionOptions = MotionOptions(),
         object_words: str | None = None,
-        in_training: bool = False,
+        as_stored: bool = False,
     ) -> list[GeneratedMotion]:
         """Motions for an English sentence on ``object`` (metres).
 
         Args:
-            in_training: whether the object is one of the training clips, in the same frame. Other objects are z up. The
-                networks see them with the axis up that is up in most training clips.
+            as_stored: whether the object is one of the dataset's, in their frame. Other objects are z up. The networks
+                see them with the axis up that is up in most training clips.
 
         Raises:
             BadInput: the text is not an English sentence, or the length is not within 8 to 150 frames.
         """
         wording = understood_words(text, self.vocabulary, lambda: self.encoder, force=True)
         hand, cloud = self._hand(text, options), sample_points(object, self.points)
-        rotation = np.eye(3, dtype=np.float32) if in_training else training_from_z_up(self.object_ups)
+        rotation = np.eye(3, dtype=np.float32) if as_stored else training_from_z_up(self.object_ups)
         first = Request(
             motion_id=f"generated/{object.name}",
             object=turned(object, rotation),
@@ -164,16 +164,16 @@ class Generator:
             answer = self.model.answers([request])[0]
             evidence = self._evidence(request, answer, hand, options, object_words or wording.noun)
             clip, coarse = answer.clip, motion_clip(request, answer.coarse, answer.object, evidence["synthetic"])
-            if not in_training:
+            if not as_stored:
                 clip, coarse = (
                     closed_as_stored(turned_back(one, object, rotation), self.hands) for one in (clip, coarse)
                 )
-            checks = self._verdict(clip, wording.verb, cloud, in_training)
+            checks = self._verdict(clip, wording.verb, cloud, as_stored)
             motions.append(GeneratedMotion(clip, coarse, answer.touched.numpy(), cloud, evidence, checks))
         return motions
 
-    def _verdict(self, clip: Clip, verb: str | None, cloud: SampledPoints, in_training: bool) -> tuple[Check, ...]:
-        up = self.object_ups.get(clip.object.model.name) if in_training else Z
+    def _verdict(self, clip: Clip, verb: str | None, cloud: SampledPoints, as_stored: bool) -> tuple[Check, ...]:
+        up = self.object_ups.get(clip.object.model.name) if as_stored else Z
         points = ObjectPoints(cloud.points_m, cloud.normals, cloud.part)
         ranges = verb_ranges(self.model.trained["diffusion"], self.hands)
         requested = requested_verb(verb, self.vocabulary.verbs, ranges, clip, points)

@@ -40,7 +40,8 @@ def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, h
     points = annotated.points(annotated.object_key(clip_id))
     sides: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
     has_sentences = clip_id in annotated.ids()
-    title = annotated.sentences(clip_id)[0] if has_sentences else f"{clip.verb or 'move'}: {clip.object_words}"
+    without = f"{annotated.verb(clip_id) or 'move'}: {clip.object_words}"
+    title = annotated.sentences(clip_id)[0] if has_sentences else without
     return write_page(
         path,
         "clip_page.html",

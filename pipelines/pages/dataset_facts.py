@@ -14,7 +14,7 @@ from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.store import Store, open_store
 
 MOST_FREQUENT = 12
-UNLABELLED = "no label in the source"
+UNLABELLED = "no verb"
 
 
 @dataclass(frozen=True)
@@ -71,13 +71,14 @@ def has_tables(root: Path, *tables: str) -> bool:
 
 def _tiles(store: Store, annotated: AnnotatedStore | None) -> list[tuple[str, str]]:
     rows, frames = store.sequences, sum(store.sequences["n_frames"].tolist())
+    verbs = rows["verb"] if annotated is None else annotated.hand_types["verb"]
     tiles = [
         (f"{len(rows):,}", "clips"),
         (f"{frames:,}", "frames at 30 fps"),
         (f"{frames / FPS / 60:.1f}", "minutes"),
         (f"{rows['subject'].nunique():,}", "subjects"),
         (f"{rows['object'].nunique():,}", "objects"),
-        (f"{rows['verb'].nunique():,}", "verbs"),
+        (f"{verbs.nunique():,}", "verbs"),
         (f"{len(store.quarantine):,}", "not converted"),
     ]
     if annotated is not None:
@@ -107,7 +108,8 @@ def _counts(store: Store, annotated: AnnotatedStore | None) -> list[tuple[str, l
     if annotated is not None:
         tables.append(("hands", _frequent(annotated.hand_types["hand_type"], "none is active")))
         tables.append(("split", _frequent([annotated.splits[clip_id] for clip_id in annotated.ids()], "none")))
-    tables.append(("verb", _frequent(store.sequences["verb"], UNLABELLED)))
+    verbs = store.sequences["verb"] if annotated is None else annotated.hand_types["verb"]
+    tables.append(("verb", _frequent(verbs, UNLABELLED)))
     tables.append(("object", _frequent(store.sequences["object_words"], "unnamed")))
     return tables
 

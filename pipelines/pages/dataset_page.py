@@ -99,7 +99,7 @@ def count_charts(annotated: AnnotatedStore) -> list[Bars]:
     return [
         count_bars("hand type", annotated.hand_types["hand_type"], "none is active"),
         count_bars(f"part of the split {chosen}", annotated.splits.values(), "none"),
-        count_bars("verb", rows["verb"], UNLABELLED),
+        count_bars("verb", annotated.hand_types["verb"], UNLABELLED),
         count_bars("object", rows["object_words"], "unnamed"),
         count_bars("subject", rows["subject"], "unnamed"),
     ]
@@ -133,11 +133,15 @@ def lengths_svg(seconds: np.ndarray, salt: str) -> str:
 def example_ids(annotated: AnnotatedStore, count: int) -> list[str]:
     """Up to ``count`` clips with sentences, chosen greedily for new hand types, verbs, objects and subjects."""
     rows = annotated.store.sequences.loc[annotated.ids()]
-    columns = [rows[name].tolist() for name in ("verb", "object", "subject")]
     hand_types = annotated.hand_types["hand_type"]
     kinds = {
-        str(clip_id): {("hand", hand_types[clip_id]), ("verb", verb), ("object", name), ("subject", subject)}
-        for clip_id, verb, name, subject in zip(rows.index, *columns, strict=True)
+        str(clip_id): {
+            ("hand", hand_types[clip_id]),
+            ("verb", annotated.verb(clip_id)),
+            ("object", name),
+            ("subject", subject),
+        }
+        for clip_id, name, subject in zip(rows.index, rows["object"], rows["subject"], strict=True)
     }
     shown: set[tuple] = set()
     chosen: list[str] = []

@@ -18,10 +18,16 @@ def shown_subset(annotated: AnnotatedStore) -> str:
     return next((subset for subset in reversed(SUBSETS) if annotated.ids(subset)), "")
 
 
-def shown_ids(annotated: AnnotatedStore, count: int) -> list[str]:
-    """Up to ``count`` clips of ``shown_subset``, one per object first."""
+def shown_ids(annotated: AnnotatedStore, count: int, samples: Path | None = None) -> list[str]:
+    """Up to ``count`` clips of ``shown_subset``, one per object first.
+
+    samples: a family's folder; if it has motions, only clips with a motion are shown (``sample.clips`` may skip some).
+    """
     subset = shown_subset(annotated)
     ids = annotated.ids(subset) if subset else []
+    if samples is not None and (samples / "clips" / "meta" / "info.json").is_file():
+        sampled = {name.rpartition("~")[0] for name in open_store(samples / "clips").ids}
+        ids = [clip_id for clip_id in ids if clip_id in sampled] or ids
     first_of_object = list({annotated.object_key(clip_id): clip_id for clip_id in reversed(ids)}.values())[::-1]
     rest = [clip_id for clip_id in ids if clip_id not in first_of_object]
     return (first_of_object + rest)[:count]

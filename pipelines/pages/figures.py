@@ -96,11 +96,10 @@ class Subject:
     def generate(self, prompt: str, samples: int = 1, size: float = 1.0) -> list[GeneratedMotion]:
         """Motions of seed 0 for a prompt; ``size``: of the object, relative to the original."""
         model = self.clip.object.model
-        is_known = not self.generator.object_ups or model.name in self.generator.object_ups
         hinge = model.hinge and replace(model.hinge, origin_m=model.hinge.origin_m * size)
         model = replace(model, vertices_m=(model.vertices_m * size).astype(model.vertices_m.dtype), hinge=hinge)
         options = MotionOptions(samples=samples)
-        return self.generator.generate(prompt, model, options, self.clip.object_words, is_known)
+        return self.generator.generate(prompt, model, options, self.clip.object_words, as_stored=True)
 
     def panel(self, caption: str, clip: Clip, paint: ContactPaint | None = None, note: str = "") -> Panel:
         """A panel with one player; ``paint``: a contact map."""

@@ -184,7 +184,8 @@ def _motions(
 ) -> tuple[list[Player], list[tuple[str, str]]]:
     """Players of a recorded clip and of the motions sampled for its sentence and object, with their ids."""
     annotated = facts.annotated
-    if annotated is None or not (ids := shown_ids(annotated, 1)):
+    generated = next(iter(sample_folders.values()))
+    if annotated is None or not (ids := shown_ids(annotated, 1, generated)):
         return [], []
     recorded = "Synthetic ground truth" if facts.synthetic else "Recorded"
     players = [_player(annotated, ids[0], annotated.clip(ids[0]), hands, recorded, true_contact(annotated, ids[0]))]
@@ -216,7 +217,7 @@ def _contact_pairs(facts: DatasetFacts, hands: HandPair, samples: Path) -> list[
     if annotated is None:
         return []
     pairs = []
-    for clip_id in shown_ids(annotated, CONTACT_EXAMPLES):
+    for clip_id in shown_ids(annotated, CONTACT_EXAMPLES, samples):
         if (motion := first_motion(samples, clip_id, hands)) is None:
             continue
         clip, sentence = annotated.clip(clip_id), annotated.sentences(clip_id)[0]
@@ -266,7 +267,7 @@ def _summary(
 
 def _examples(annotated: AnnotatedStore, samples: Path, hands: HandPair) -> list[Example]:
     examples = []
-    for clip_id in shown_ids(annotated, MAX_EXAMINED):
+    for clip_id in shown_ids(annotated, MAX_EXAMINED, samples):
         if (motion := first_motion(samples, clip_id, hands)) is not None:
             checks, paint = verdict(motion, hands), motion_contact(annotated, clip_id, motion, hands)
             n_failed = sum(check.passed is False for check in checks)

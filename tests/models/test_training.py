@@ -337,7 +337,7 @@ def test_own_meshes_get_the_axis_up_that_was_up_in_training(trained: Path, monke
     z_up, text, options = user_box(), "Lift a box with the left hand.", MotionOptions(frames=8)
     y_up = replace(z_up, vertices_m=z_up.vertices_m[:, [0, 2, 1]] * [1, 1, -1])
     generated = generator(trained).generate(text, z_up, options)[0]
-    expected = generator(trained).generate(text, y_up, options, in_training=True)[0]
+    expected = generator(trained).generate(text, y_up, options, as_stored=True)[0]
     world_m, expected_m = (
         one.clip.object.points_in_world(one.clip.object.model.vertices_m, z_up.part) for one in (generated, expected)
     )

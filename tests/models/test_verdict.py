@@ -1,5 +1,6 @@
 """The verdict on a motion: bad motions fail the check that a viewer would name, good motions pass."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -23,9 +24,10 @@ from hoidata.metrics.verdict import (
     verdict_lines,
 )
 from hoidata.objects.sampling import sample_points
-from hoidata.store.annotated import AnnotatedStore
-from tests.builders.clips import DOWN, clip_of, flat_hand, still_object
+from hoidata.store.annotated import AnnotatedStore, load_annotated
+from tests.builders.clips import DOWN, build_clip, clip_of, flat_hand, still_object
 from tests.builders.objects import box_model, model_of
+from tests.builders.stores import write_annotated
 
 HANDS, FRAMES = load_embedded_hands(), 30
 BOX = box_model((0.10, 0.10, 0.10))
@@ -289,6 +291,17 @@ def test_the_usual_up_direction_of_each_training_object(annotated: AnnotatedStor
         clip = annotated.clip(clip_id)
         rotation = Rotation.from_rotvec(clip.object.rotvec[0])
         assert rotation.apply(ups[clip.object.model.name]) @ clip.gravity < -0.9
+
+
+def test_an_object_that_starts_in_too_different_poses_has_no_side_that_is_up(tmp_path, monkeypatch) -> None:
+    clips = [build_clip(12, seed=number, clip_id=f"toy/s1/{number}") for number in range(2)]
+    store = load_annotated(write_annotated(tmp_path, clips, rule={"by": "subject", "train": "rest"}))
+    for degrees, is_known in ((0, True), (30, True), (60, False)):
+        angles = itertools.cycle(np.radians((degrees, -degrees)))
+        monkeypatch.setattr(
+            "hoidata.metrics.verb_ranges.up_in_object", lambda *_, a=angles: Rotation.from_euler("x", next(a)).apply(Z)
+        )
+        assert list(object_ups(store).values()) == [pytest.approx(Z)] * is_known
 
 
 def test_the_samples_that_fail_the_fewest_checks_are_kept_the_best_first() -> None:

@@ -13,7 +13,14 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.files.written import read_table
 from hoidata.store.annotated import load_annotated
 from pipelines.pages.dataset_facts import majority_verb, read_dataset
-from pipelines.pages.dataset_page import contact_by_object, count_bars, example_ids, still_of, write_dataset_page
+from pipelines.pages.dataset_page import (
+    contact_by_object,
+    count_bars,
+    count_charts,
+    example_ids,
+    still_of,
+    write_dataset_page,
+)
 from pipelines.pages.player import view_of
 from pipelines.pages.report import ReportFolders, write_report
 from pipelines.show_pages import closest_ids, dataset_of_clip, write_named_page
@@ -195,3 +202,15 @@ def test_a_missing_stage_is_named(project, tmp_path):
     (project / "contact").rename(project / "elsewhere")
     with pytest.raises(MissingResource, match="run the stage 'contact'"):
         write_named_page("grab/s1/box_1", "embedded", tmp_path)
+
+
+def test_verbs_derived_from_motion_are_counted(page_clip, hands, tmp_path):
+    clips = [replace(page_clip(), clip_id=f"test/s1/{number}", verb=None) for number in range(2)]
+    write_annotated(tmp_path / "toy", clips, threshold_m=0.09)
+    facts = read_dataset(tmp_path / "toy", "toy", hands)
+    assert facts.annotated is not None
+    verb = facts.annotated.verb("test/s1/0")
+    (chart,) = [one for one in count_charts(facts.annotated) if one.title == "verb"]
+    assert [bar[:2] for bar in chart.bars] == [(verb, 2)]
+    assert ("1", "verbs") in facts.tiles
+    assert dict(facts.counts)["verb"] == [(verb, 2)]

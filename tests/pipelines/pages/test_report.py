@@ -15,6 +15,7 @@ from pipelines.pages.examples import shown_ids
 from pipelines.pages.player import three_javascript
 from pipelines.pages.report import ReportFolders, write_report
 from pipelines.run_facts import describe_results
+from tests.builders.annotated import write_annotated_dataset
 from tests.builders.stores import write_annotated, write_clips
 
 HELD_OUT = {"by": "subject", "train": "rest", "test": ["s2"], "promises": ["subject"]}
@@ -156,3 +157,12 @@ def test_a_leading_metric_that_was_not_measured_is_named_with_its_reason_apart_f
         "whole": figures,
         "not measured": {"ours": {"deep_share": "the object has no inside: 257 clips"}},
     }
+
+
+def test_clips_without_a_generated_motion_are_not_shown(make_clip, tmp_path):
+    root, test = write_annotated_dataset(tmp_path / "toy", make_clip)
+    annotated, (_, last) = load_annotated(root), test
+    write_clips(tmp_path / "sampled" / "clips", [replace(test[last], clip_id=f"{last}~0")])
+    assert set(shown_ids(annotated, 5)) == set(test)
+    assert shown_ids(annotated, 5, tmp_path / "sampled") == [last]
+    assert shown_ids(annotated, 5, tmp_path / "nothing") == shown_ids(annotated, 5)
