@@ -176,7 +176,12 @@ TABLES = {
         unranked=frozenset(CONTROLS),
     ),
     "presets": Table(
-        {"presets-study": "subjects", "presets-composition": "composition", "presets-object": "unseen object"},
+        {
+            "presets-study": "subjects",
+            "presets-composition": "composition",
+            "presets-object": "unseen object",
+            "presets-arctic": "recorded ARCTIC",
+        },
         PRESETS,
         ("verb accuracy", "contact F1", "adherence", "deep", "slip", "realism", "joints"),
         intervals=False,
