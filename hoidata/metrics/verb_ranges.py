@@ -24,7 +24,7 @@ SLIP = "slip_cm_s"
 LEAST_DEVIATION_CM_S = 0.05  # of slip, for recorded hands that never slip
 MIN_LIFT_FRACTION = 0.5  # of the checked frames in the air, in which the hands must be able to carry the object
 ACCEPTED = (2, 0.0)  # ranks that begin so need no further candidate
-ALIKE_UPS = 0.85  # length of the mean of unit vectors; 1 if all are equal
+ALIKE_UPS = 0.85  # length of the mean of directions that are up, unit vectors; 1 if all are equal
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ class DistanceFields:
         return self._nearest(self.distances, rows, points_m, hinge_rad)[..., 0]
 
     def _nearest(self, values: Tensor, rows: Tensor, points_m: Tensor, hinge_rad: Tensor) -> Tensor:
-        """(B, F, P, C) interpolated ``values`` (node, C) of the nearer part, vectors in the object frame."""
+        """(B, F, P, C) interpolated ``values`` (node, C) of the closer part, vectors in the object frame."""
         only_base = not self.has_lid[rows.cpu()].any()
         rows = send(rows, points_m.device)
         base = self._read(values, rows, 0, points_m)

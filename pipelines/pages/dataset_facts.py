@@ -71,14 +71,13 @@ def has_tables(root: Path, *tables: str) -> bool:
 
 def _tiles(store: Store, annotated: AnnotatedStore | None) -> list[tuple[str, str]]:
     rows, frames = store.sequences, sum(store.sequences["n_frames"].tolist())
-    verbs = rows["verb"] if annotated is None else annotated.hand_types["verb"]
     tiles = [
         (f"{len(rows):,}", "clips"),
         (f"{frames:,}", "frames at 30 fps"),
         (f"{frames / FPS / 60:.1f}", "minutes"),
         (f"{rows['subject'].nunique():,}", "subjects"),
         (f"{rows['object'].nunique():,}", "objects"),
-        (f"{verbs.nunique():,}", "verbs"),
+        (f"{_verbs(store, annotated).nunique():,}", "verbs"),
         (f"{len(store.quarantine):,}", "not converted"),
     ]
     if annotated is not None:
@@ -108,10 +107,14 @@ def _counts(store: Store, annotated: AnnotatedStore | None) -> list[tuple[str, l
     if annotated is not None:
         tables.append(("hands", _frequent(annotated.hand_types["hand_type"], "none is active")))
         tables.append(("split", _frequent([annotated.splits[clip_id] for clip_id in annotated.ids()], "none")))
-    verbs = store.sequences["verb"] if annotated is None else annotated.hand_types["verb"]
-    tables.append(("verb", _frequent(verbs, UNLABELLED)))
+    tables.append(("verb", _frequent(_verbs(store, annotated), UNLABELLED)))
     tables.append(("object", _frequent(store.sequences["object_words"], "unnamed")))
     return tables
+
+
+def _verbs(store: Store, annotated: AnnotatedStore | None) -> pd.Series:
+    """The annotated verb of every clip; without annotation the source's."""
+    return store.sequences["verb"] if annotated is None else annotated.hand_types["verb"]
 
 
 def count_values(column: Iterable, missing: str) -> list[tuple[str, int]]:

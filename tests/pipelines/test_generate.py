@@ -204,7 +204,7 @@ def notes(verb, path, hinge=""):
     return _missing_hinge_notes(verb, path, read_user_object(path, up="z", hinge=hinge).model)
 
 
-@pytest.mark.parametrize("verb", ["open", "close"])
+@pytest.mark.parametrize("verb", ["open", "close", "open and close"])
 def test_the_note_on_a_mesh_of_two_pieces_without_a_hinge_names_the_option(box, verb):
     (note,) = notes(verb, box)
     assert note.startswith(
