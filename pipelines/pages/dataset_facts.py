@@ -114,7 +114,7 @@ def _counts(store: Store, annotated: AnnotatedStore | None) -> list[tuple[str, l
 
 def _verbs(store: Store, annotated: AnnotatedStore | None) -> pd.Series:
     """The annotated verb of every clip; without annotation the source's."""
-    return store.sequences["verb"] if annotated is None else annotated.hand_types["verb"]
+    return pd.Series(store.sequences["verb"] if annotated is None else annotated.hand_types["verb"])
 
 
 def count_values(column: Iterable, missing: str) -> list[tuple[str, int]]:
