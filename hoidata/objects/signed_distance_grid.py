@@ -32,7 +32,8 @@ class DistanceFields:
         """Compute the grids of (key, model) pairs with ``resolution`` nodes along each axis."""
         self.resolution = resolution
         self.row: dict[str, int] = {}
-        values, low, high, axis, origin, slide, has_lid = [], [], [], [], [], [], []
+        self.any_lid = False
+        values, low, high, axis, origin, slide = [], [], [], [], [], []
         for key, model in objects:
             if key in self.row:
                 continue
@@ -43,10 +44,9 @@ class DistanceFields:
             for stack, vector in zip((axis, slide), joint_vectors(model), strict=True):
                 stack.append(vector)
             origin.append(np.zeros(3) if model.hinge is None else model.hinge.origin_m)
-            has_lid.append(1 in model.parts)
+            self.any_lid |= 1 in model.parts
         self.values = torch.from_numpy(np.concatenate(values))
         self.distances = self.values[:, :1].contiguous()
-        self.has_lid = torch.tensor(has_lid)  # stays on the CPU
         self.low, self.high = _tensor(low).reshape(-1, 2, 3), _tensor(high).reshape(-1, 2, 3)
         self.axis, self.origin, self.slide_m = _tensor(axis), _tensor(origin), _tensor(slide)
 
@@ -75,10 +75,9 @@ class DistanceFields:
 
     def _nearest(self, values: Tensor, rows: Tensor, points_m: Tensor, hinge_rad: Tensor) -> Tensor:
         """(B, F, P, C) interpolated ``values`` (node, C) of the closer part, vectors in the object frame."""
-        only_base = not self.has_lid[rows.cpu()].any()
         rows = send(rows, points_m.device)
         base = self._read(values, rows, 0, points_m)
-        if only_base:
+        if not self.any_lid:
             return base
         rotation = rotvec_to_rotmat(self.axis[rows][:, None] * hinge_rad[..., None])
         origin = self.origin[rows][:, None, None]

@@ -51,6 +51,7 @@ def test_distances_alone_and_beside_a_hinged_object_are_those_of_the_query():
     vertices, faces = sphere(0.05, 40)
     ball = ObjectModel("ball", vertices, faces, np.zeros(len(vertices), np.uint8))
     fields = DistanceFields([("ball", ball), ("cube", divided_cube())], 24)
+    without_hinge = DistanceFields([("ball", ball)], 24)
     points = torch.from_numpy(np.random.default_rng(0).uniform(-0.09, 0.09, (2, 3, 50, 3)).astype(np.float32))
     angle = torch.full((2, 3), 0.4)
 
@@ -62,7 +63,7 @@ def test_distances_alone_and_beside_a_hinged_object_are_those_of_the_query():
 
     both = measured([0, 1], lambda *query: fields.query(*query)[0])
     only = measured([0, 1], fields.distance)
-    alone = measured([0], fields.distance, slice(1))
+    alone = measured([0], without_hinge.distance, slice(1))
     moved = measured([0, 1], lambda rows, places, angles: fields.distance(rows, places, 0 * angles))
     for whole, distances, of_ball in zip(both, only, alone, strict=True):
         assert torch.equal(whole, distances)
