@@ -2,7 +2,7 @@
 
 from hoidata.metrics.feature_metrics import FEATURE_METRICS, FeatureMetric
 from hoidata.metrics.optional_metrics import OPTIONAL_LISTS
-from hoidata.metrics.registry import METRICS, Metric
+from hoidata.metrics.registry import LIFTED, METRICS, Metric
 
 _HEAD = """# Metrics
 
@@ -16,8 +16,8 @@ with the reason, and an entry in `METRICS`. The entry is the only place that nam
 - *closer to recorded*: the value of the recorded clips (family `ground-truth`) is best.
 - *floor of*: a lower bound of another metric. It is not ranked.
 - *Hand frames*: frames in which the recorded clip has an active hand. *Lifted frames*: frames in which the object is
-  more than 15 mm above the table, the 3rd percentile of the lowest vertex of the recorded clip. Interpolated frames
-  are never used.
+  more than 15 mm above the table, the 3rd percentile of its lowest vertex in all clips of the recording. Interpolated
+  frames are never used.
 - Values are means over motions unless the definition says otherwise. *Best sample*: the best motion of each clip.
   `counts` gives the number of clips, motions and values.
 - A clip without a value is not counted as 0. `unmeasured` gives the reasons and the number of clips for each metric;
@@ -47,9 +47,7 @@ space.
 """
 _SHORTER = {
     "frames in which the reference has the acting hand": "hand frames",
-    "frames in which the object is more than 15 mm above the table (3rd percentile of the true clip's lowest vertex)": (
-        "lifted frames"
-    ),
+    LIFTED: "lifted frames",
     "distance and points of the contact stage (its info.json)": "threshold of the contact stage",
     "in the true clip": "in the recorded clip",
     "of all clips of a repetition, mean over repetitions": "over all clips",

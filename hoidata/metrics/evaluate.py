@@ -35,7 +35,7 @@ from hoidata.metrics.registry import METRICS, Metric, count_unmeasured, sum_and_
 from hoidata.metrics.target_contact import TargetDistances, read_target_contact, read_target_distances
 from hoidata.metrics.unmeasured import CHOSEN_LENGTH, Values
 from hoidata.objects.model import ObjectModel
-from hoidata.physics.scene import object_scene
+from hoidata.physics.scene import TABLE_PERCENTILE, object_scene
 from hoidata.settings import build_config
 from hoidata.store.annotated import AnnotatedStore, WindowedStore, WindowProtocol, load_annotated
 from hoidata.store.distances import DistanceEntries
@@ -255,6 +255,7 @@ class _Evaluator:
     target_distances: dict[str, TargetDistances]  # by predicted id
     actions: Actions
     indices: dict[str, ProximityIndex] = field(default_factory=dict)  # cache by object
+    tables_m: dict[tuple[object, ...], float] = field(default_factory=dict)  # cache by recording and frame
 
     @property
     def own_length(self) -> bool:
@@ -332,9 +333,31 @@ class _Evaluator:
             index=self.indices[name],
             part=points.part,
             threshold_m=annotated.contact_threshold_m,
-            table_m=None if motion.clip.gravity is None else object_scene(motion.clip).table_height_m,
+            table_m=self._table_m(motion.clip),
             verb=annotated.verb(clip_id),
         )
+
+    def _table_m(self, clip: Clip) -> float | None:
+        """Height of the table above the world's origin, from all clips of the recording; None without gravity.
+
+        One clip is not enough: it may be cut from frames in which the object is held throughout.
+        """
+        if clip.gravity is None:
+            return None
+        store, world = self.annotated.store, _world(clip)
+        columns = store.sequences[["sequence", "object"]]
+        recording = *columns.loc[clip.clip_id], *world
+        if recording not in self.tables_m:
+            names = columns.index[(columns == columns.loc[clip.clip_id]).all(axis=1)]
+            clips = (store.clip(name, motion_only=True) for name in names)
+            lowest_m = [object_scene(other).lowest_m for other in clips if _world(other) == world]
+            self.tables_m[recording] = float(np.percentile(np.concatenate(lowest_m), TABLE_PERCENTILE))
+        return self.tables_m[recording]
+
+
+def _world(clip: Clip) -> tuple[bytes, bytes]:
+    """The frame and gravity of a clip, to compare with those of another."""
+    return clip.source_from_world.tobytes(), b"" if clip.gravity is None else clip.gravity.tobytes()
 
 
 def _values(metric: Metric, pair: Pair) -> Values:

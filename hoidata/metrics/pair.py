@@ -51,7 +51,7 @@ class Pair:
     reference: Motion
     sides: tuple[Side, ...]  # the hands that act in the reference clip
     contact: TrueContact
-    table_m: float | None  # height of the table under the object of the whole reference clip; None without gravity
+    table_m: float | None  # height of the table under the object in the reference's recording; None without gravity
     # Frame i of both is the same moment, and the prediction has its hands wherever the reference has them.
     # False: the family chose the length.
     aligned: bool = True
@@ -81,7 +81,7 @@ class Pair:
 
     @cached_property
     def scene(self) -> Scene | Unmeasured:
-        """The acting hands of the prediction and its object, on the table of the reference clip.
+        """The acting hands of the prediction and its object, on the table of the reference.
 
         Unmeasured without gravity, for an object that is not a closed solid, and below three frames.
         """

@@ -69,8 +69,8 @@ class Result(NamedTuple):
 
 WHOLE = f"{HANDS}, all together"
 LIFTED = (
-    f"frames in which the object is more than {1000 * LIFTED_M:g} mm above the table (3rd percentile of the true "
-    "clip's lowest vertex)"
+    f"frames in which the object is more than {1000 * LIFTED_M:g} mm above the table (3rd percentile of the lowest "
+    "vertex in its recording)"
 )
 DEEP = f"hand capsule {1000 * LARGEST_PENETRATION_M:g} mm or more inside it"
 SCORED = f"{LIFTED}, and no {DEEP}"

@@ -11,11 +11,13 @@ from hoidata.actions.action import action_numbers, learn_actions
 from hoidata.clips.clip import FPS, HandTrack, ObjectTrack
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.metrics import motion, touch
+from hoidata.metrics.evaluate import evaluate_store
 from hoidata.metrics.registry import METRICS
 from hoidata.metrics.unmeasured import NO_GRAVITY, NO_INSIDE, Unmeasured
 from hoidata.objects.model import ObjectModel
 from hoidata.physics.mano_capsules import hand_capsules
 from tests.builders.clips import with_object
+from tests.builders.stores import write_annotated, write_clips
 
 HALF_M = np.array([0.05, 0.04, 0.03])  # of the box of tests/conftest.py
 
@@ -237,6 +239,26 @@ def test_realism_is_scored_only_above_the_table_of_the_recording(make_clip, pair
     assert len(motion.realism_si(pair_of(carried, carried, table_m=-BOTTOM_M - 0.02), 1)) == 12
     assert len(motion.realism_si(pair_of(carried, carried, table_m=-BOTTOM_M - 0.02), 3)) == 4
     assert motion.realism_si(pair_of(carried, carried, table_m=None), 1) == NO_GRAVITY
+
+
+def test_the_table_of_a_clip_that_is_cut_while_held_is_that_of_its_recording(make_clip, moved, tmp_path):
+    held = on_a_hand(make_clip)
+    other_frame = np.diag([2.0, 2.0, 2.0, 1.0])
+
+    def clip(name, recording, height_m, source_from_world=held.source_from_world):
+        lifted = moved(held, (0, 0, height_m))
+        path = held.object.translation_m + np.float32([0, 0, height_m])
+        names = {"clip_id": f"toy/{name}", "subject": name.split("/")[0], "sequence": recording}
+        track = replace(held.object, translation_m=path)
+        return replace(lifted, object=track, source_from_world=source_from_world, **names)
+
+    clips = [clip("s1/0", "other", -0.5), clip("s2/0", "another", -0.6)]
+    clips += [clip("s3/0", "cut", 0), clip("s3/1", "cut", 0.1), clip("s3/2", "cut", -0.7, other_frame)]
+    clips += [clip("s3/3", "alone", 0.1)]
+    root = write_annotated(tmp_path / "data", clips, points=256)
+    evaluation = evaluate_store(write_clips(tmp_path / "same", clips[2:]), root)
+    assert evaluation["counts"]["realism_si"]["clips"] == 1
+    assert evaluation["figures"]["realism_si"] == 1
 
 
 def test_every_frame_is_scored_and_the_table_carries_what_rests_on_it(make_clip, pair_of):
