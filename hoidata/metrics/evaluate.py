@@ -44,6 +44,7 @@ from hoidata.workers import map_in_workers
 
 SAME_MESH_M = 1e-5  # above the float32 rounding of metres
 DIGITS = 6
+RECORDING = ["subject", "sequence", "object"]  # clips with equal values are parts of one recording of an object
 WORKERS_PAY_FROM = 1000  # motions: starting a worker process takes as long as measuring 200
 
 
@@ -112,6 +113,7 @@ def evaluate_store(
         BadInput: no clip of the two stores can be compared.
     """
     annotated, store = load_annotated(reference, hands), open_store(predicted, hands)
+    recordings = annotated.store
     if protocol := store.info.get("windows"):
         source = f"{predicted}/meta/info.json: windows"
         annotated = WindowedStore(annotated, build_config(WindowProtocol, protocol, source), split)
@@ -119,6 +121,7 @@ def evaluate_store(
     samples, skipped = match_predictions(store.ids, clip_ids)
     evaluator = _Evaluator(
         annotated=annotated,
+        recordings=recordings,
         store=store,
         metrics=metrics,
         samples=samples,
@@ -248,6 +251,7 @@ class _Evaluator:
     """Measures all predictions of a reference clip."""
 
     annotated: AnnotatedStore
+    recordings: Store  # its clips, whole also if windows of them are evaluated
     store: Store  # of the predictions
     metrics: tuple[Metric, ...]
     samples: dict[str, list[tuple[int, str]]]  # number and id of the predictions, by reference id
@@ -344,13 +348,12 @@ class _Evaluator:
         """
         if clip.gravity is None:
             return None
-        store, world = self.annotated.store, _world(clip)
-        columns = store.sequences[["sequence", "object"]]
-        recording = *columns.loc[clip.clip_id], *world
+        key, world = self.annotated.store.sequences.loc[clip.clip_id, RECORDING], _world(clip)
+        recording = *key, *world
         if recording not in self.tables_m:
-            names = columns.index[(columns == columns.loc[clip.clip_id]).all(axis=1)]
-            clips = (store.clip(name, motion_only=True) for name in names)
-            lowest_m = [object_scene(other).lowest_m for other in clips if _world(other) == world]
+            rows = self.recordings.sequences[RECORDING]
+            clips = (self.recordings.clip(name, motion_only=True) for name in rows.index[(rows == key).all(axis=1)])
+            lowest_m = [object_scene(other).lowest_m[other.recorded] for other in clips if _world(other) == world]
             self.tables_m[recording] = float(np.percentile(np.concatenate(lowest_m), TABLE_PERCENTILE))
         return self.tables_m[recording]
 

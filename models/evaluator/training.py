@@ -16,6 +16,7 @@ from models.evaluator.inputs import Examples
 from models.evaluator.networks import MotionEncoder, rotated
 
 LABEL_SMOOTHING = 0.05
+LARGEST_WEIGHT = 5.0  # of a label in the loss: a verb of two clips among 2,000 would decide the network
 EVALUATION_BATCH = 256
 PLATEAU_EPOCHS = 4  # epochs without gain before the learning rate falls
 
@@ -47,14 +48,14 @@ class Classification:
     """The task of predicting the verb of a motion."""
 
     labels: tuple[str, ...]
-    weights: Tensor  # (label,) weights in the loss, inverse to the frequency
+    weights: Tensor  # (label,) weights in the loss, inverse to the frequency, at most ``LARGEST_WEIGHT``
     kind: str  # "sigmoid" per label, as IMoS released it, or "softmax" with label smoothing
 
     @classmethod
     def of(cls, train: Examples, kind: str) -> "Classification":
         labels = train.trained_verbs
         counts = torch.bincount(train.labels(labels), minlength=len(labels))
-        return cls(labels, len(train) / (len(labels) * counts), kind)
+        return cls(labels, (len(train) / (len(labels) * counts)).clamp(max=LARGEST_WEIGHT), kind)
 
     def targets(self, examples: Examples) -> tuple[Tensor, ...]:
         """The target labels (clip,)."""

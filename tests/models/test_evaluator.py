@@ -191,6 +191,9 @@ def test_rare_classes_weigh_more_and_untrained_labels_nothing(annotated):
     task = Classification.of(train, "softmax")
     assert task.labels == ("lift", "open", "pass")
     assert task.weights.tolist() == [1, 1, 1]
+    of_verbs = replace(train, ids=["a"] * 200, verbs=["lift"] * 120 + ["open"] * 78 + ["pass"] * 2)
+    weights = Classification.of(of_verbs, "softmax").weights
+    assert weights.tolist() == pytest.approx([200 / 360, 200 / 234, 5])  # and not 33, which would decide the network
     network, logits = evaluator(CORRECTED).network, torch.randn(3, 3)
     loss_of_two = task.loss(network, logits[:2], (torch.tensor([0, 2]),), None)
     assert task.loss(network, logits, (torch.tensor([0, 2, -1]),), None) == loss_of_two

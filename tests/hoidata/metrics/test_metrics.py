@@ -17,7 +17,7 @@ from hoidata.metrics.unmeasured import NO_GRAVITY, NO_INSIDE, Unmeasured
 from hoidata.objects.model import ObjectModel
 from hoidata.physics.mano_capsules import hand_capsules
 from tests.builders.clips import with_object
-from tests.builders.stores import write_annotated, write_clips
+from tests.builders.stores import BY_SUBJECT, write_annotated, write_clips
 
 HALF_M = np.array([0.05, 0.04, 0.03])  # of the box of tests/conftest.py
 
@@ -245,17 +245,18 @@ def test_the_table_of_a_clip_that_is_cut_while_held_is_that_of_its_recording(mak
     held = on_a_hand(make_clip)
     other_frame = np.diag([2.0, 2.0, 2.0, 1.0])
 
-    def clip(name, recording, height_m, source_from_world=held.source_from_world):
-        lifted = moved(held, (0, 0, height_m))
-        path = held.object.translation_m + np.float32([0, 0, height_m])
-        names = {"clip_id": f"toy/{name}", "subject": name.split("/")[0], "sequence": recording}
-        track = replace(held.object, translation_m=path)
-        return replace(lifted, object=track, source_from_world=source_from_world, **names)
+    def clip(name, recording, height_m, source_from_world=held.source_from_world, plate="plate"):
+        subject, low = name.split("/")[0], np.float32([0, 0, height_m])
+        model = replace(held.object.model, name=plate)
+        track = replace(held.object, model=model, translation_m=held.object.translation_m + low)
+        names = {"clip_id": f"toy/{name}", "subject": subject, "sequence": recording}
+        return replace(moved(held, low), object=track, source_from_world=source_from_world, **names)
 
     clips = [clip("s1/0", "other", -0.5), clip("s2/0", "another", -0.6)]
-    clips += [clip("s3/0", "cut", 0), clip("s3/1", "cut", 0.1), clip("s3/2", "cut", -0.7, other_frame)]
-    clips += [clip("s3/3", "alone", 0.1)]
-    root = write_annotated(tmp_path / "data", clips, points=256)
+    clips += [clip("s3/0", "cut", 0), clip("s3/1", "cut", 0.1)]  # only the second is above the table
+    clips += [clip("s3/2", "cut", 0.7, other_frame), clip("s3/3", "cut", -0.8, plate="another")]
+    clips += [clip("s3/4", "same name", -0.9), clip("s4/0", "same name", 0.2)]
+    root = write_annotated(tmp_path / "data", clips, rule=BY_SUBJECT | {"test": ["s3", "s4"]}, points=256)
     evaluation = evaluate_store(write_clips(tmp_path / "same", clips[2:]), root)
     assert evaluation["counts"]["realism_si"]["clips"] == 1
     assert evaluation["figures"]["realism_si"] == 1

@@ -50,7 +50,7 @@ def test_beyond_the_grid_the_torch_look_up_goes_on_and_the_search_s_stays_below(
 def test_distances_alone_and_beside_a_hinged_object_are_those_of_the_query():
     vertices, faces = sphere(0.05, 40)
     ball = ObjectModel("ball", vertices, faces, np.zeros(len(vertices), np.uint8))
-    fields = DistanceFields([("ball", ball), ("cube", divided_cube())], 24)
+    fields = DistanceFields([("cube", divided_cube()), ("ball", ball)], 24)
     without_hinge = DistanceFields([("ball", ball)], 24)
     points = torch.from_numpy(np.random.default_rng(0).uniform(-0.09, 0.09, (2, 3, 50, 3)).astype(np.float32))
     angle = torch.full((2, 3), 0.4)
@@ -61,10 +61,10 @@ def test_distances_alone_and_beside_a_hinged_object_are_those_of_the_query():
         distance = function(torch.tensor(rows), places, angle[chosen])
         return distance.detach(), torch.autograd.grad(distance.square().sum(), places)[0]
 
-    both = measured([0, 1], lambda *query: fields.query(*query)[0])
-    only = measured([0, 1], fields.distance)
+    both = measured([1, 0], lambda *query: fields.query(*query)[0])
+    only = measured([1, 0], fields.distance)
     alone = measured([0], without_hinge.distance, slice(1))
-    moved = measured([0, 1], lambda rows, places, angles: fields.distance(rows, places, 0 * angles))
+    moved = measured([1, 0], lambda rows, places, angles: fields.distance(rows, places, 0 * angles))
     for whole, distances, of_ball in zip(both, only, alone, strict=True):
         assert torch.equal(whole, distances)
         assert torch.equal(whole[:1], of_ball)
