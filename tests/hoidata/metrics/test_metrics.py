@@ -16,6 +16,8 @@ from hoidata.metrics.registry import METRICS
 from hoidata.metrics.unmeasured import NO_GRAVITY, NO_INSIDE, Unmeasured
 from hoidata.objects.model import ObjectModel
 from hoidata.physics.mano_capsules import hand_capsules
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
 from tests.builders.clips import with_object
 from tests.builders.stores import BY_SUBJECT, write_annotated, write_clips
 
@@ -260,6 +262,18 @@ def test_the_table_of_a_clip_that_is_cut_while_held_is_that_of_its_recording(mak
     evaluation = evaluate_store(write_clips(tmp_path / "same", clips[2:]), root)
     assert evaluation["counts"]["realism_si"]["clips"] == 1
     assert evaluation["figures"]["realism_si"] == 1
+
+
+def test_the_table_of_a_window_is_that_of_the_whole_recording(make_clip, tmp_path):
+    held = on_a_hand(make_clip)
+    rises = replace(held, object=replace(held.object, translation_m=held.object.translation_m.copy()))
+    rises.object.translation_m[:2, 2] -= 0.1
+    clip = replace(rises, clip_id="toy/s3", subject="s3")
+    root = write_annotated(tmp_path / "data", [clip], points=256)
+    window = replace(clip.take(slice(2, 10)), clip_id="toy/s3@2")
+    windows = {"start": 2, "stride": 8, "frames": 8, "trimmed_end": 1}
+    write_store(tmp_path / "window", [window], generated_info("predicted") | {"windows": windows})
+    assert evaluate_store(tmp_path / "window", root)["figures"]["realism_si"] == 1
 
 
 def test_every_frame_is_scored_and_the_table_carries_what_rests_on_it(make_clip, pair_of):
