@@ -32,7 +32,10 @@ from pipelines.params import load_yaml
 
 FOLDER = Path(__file__).parent
 METRIC = {metric.name: metric for metric in ALL_METRICS}
-ORDERED_BY = "accuracy_top3_paper"
+ORDERED_BY = {
+    "Order by top-3 accuracy": "accuracy_top3_paper",
+    "By that of the corrected evaluator": "accuracy_top3_corrected",
+}
 STATIC = [ordering for ordering in EXPECTED_ORDERINGS if ordering.control == "static"]
 LEGEND = "In parentheses: 95 % interval over clips. ±: "
 REPETITIONS_LEGEND = "95 % interval over repetitions of sampling, of one training; 0 for a method without randomness."
@@ -153,10 +156,9 @@ class PaperTable:
             parts.append(f"Difference from the reference row:\n\n{self.differences(results)}")
         if paper := self.content.get("paper"):
             methods = paper["methods"][self.dataset]
-            values = {line.title: seeds for line in self.rows if (seeds := line.values(results, ORDERED_BY))}
-            here = sorted(values, key=lambda title: -mean_value(values[title]))
-            theirs = sorted(methods, key=lambda name: -methods[name][0])
-            parts.append(f"Order by top-3 accuracy: {' > '.join(here)}. In the paper: {' > '.join(theirs)}.")
+            orders = {title: self.order(results, metric) for title, metric in ORDERED_BY.items()}
+            orders["In the paper"] = sorted(methods, key=lambda name: -methods[name][0])
+            parts.append(" ".join(f"{title}: {' > '.join(names)}." for title, names in orders.items() if names))
             lines = [[name, *map(str, values)] for name, values in methods.items()]
             parts += [] if "texts" in hidden else [paper["reasons"]]
             parts.append(markdown_lines(["paper", *paper["columns"]], lines))
@@ -178,6 +180,11 @@ class PaperTable:
         table = markdown_lines(head, lines)
         notes = "; ".join(f"{title}: {reason}" for title, reason in empty.items())
         return table + (f"\n\nMeasured in no row: {notes}." if empty else "")
+
+    def order(self, results: Results, metric: str) -> list[str]:
+        """The titles of the lines with a value, the highest first."""
+        values = {line.title: seeds for line in self.rows if (seeds := line.values(results, metric))}
+        return sorted(values, key=lambda title: -mean_value(values[title]))
 
     def minutes(self, line: Row, results: Results) -> str:
         """Processor minutes of all trainings of the row's package and of its sampling, mean over seeds."""
