@@ -48,6 +48,7 @@ from pipelines.command_inputs import (
     trained_run,
     write_motion_store,
 )
+from pipelines.exports.motion import verbs_of
 from pipelines.pages.hands_page import write_hands
 from pipelines.pages.motion_files import hand_shapes, older_motion_notes
 from pipelines.show_pages import dataset_of_clip
@@ -259,14 +260,15 @@ def _clip_motion(options: HandsOptions, project: ProjectData, wish: HandSampling
     if options.object:
         raise BadInput("object", "no object with --clip, which has one", options.object, "omit it")
     paths = dataset_of_clip(options.clip, project.profile, list(project.datasets))
-    clip = open_store(paths.clips, project.hands).clip(options.clip)
+    store = open_store(paths.clips, project.hands)
+    clip = store.clip(options.clip)
     track, limits_rad = clip.object, hinge_range(options.hinge_range, clip.object.model)
     check_joint_range(track.model, track.hinge_rad, limits_rad, options.clip)
     betas, template_m = hand_shapes(clip)
     notes = [] if clip.gravity is not None else ["up: z, assumed: the gravity of this clip is not known"]
     gravity = wish.gravity if clip.gravity is None else np.asarray(clip.gravity, np.float64)
     wish = replace(wish, words=clip.object_words, gravity=gravity, betas=betas, template_m=template_m)
-    return ObjectMotion(clip.object, wish, f"clip {options.clip}", notes, verb=clip.verb)
+    return ObjectMotion(clip.object, wish, f"clip {options.clip}", notes, verb=verbs_of(store).get(options.clip))
 
 
 def _generated_motion(options: HandsOptions, project: ProjectData, wish: HandSamplingOptions) -> ObjectMotion:

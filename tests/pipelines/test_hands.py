@@ -17,6 +17,7 @@ from hoidata.files.arrays import write_npz
 from hoidata.hands import load_embedded_hands
 from hoidata.object_paths import keyframed_path, parse_keyframes
 from hoidata.objects.user_mesh import read_user_object
+from hoidata.store.annotated import load_annotated
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from models.bimart.hands import ContactMeasures
@@ -27,6 +28,7 @@ from pipelines.pages.hands_page import _measures
 from pipelines.pages.motion_files import mesh_arrays, motion_arrays, older_motion_notes
 from tests.builders.clips import clip_of
 from tests.builders.objects import hinged_box
+from tests.builders.stores import write_annotated
 from tests.builders.urdf import write_drawer, write_partnet
 
 HANDS = load_embedded_hands()
@@ -248,6 +250,14 @@ def test_a_hinge_range_bounds_the_motion_of_a_clip(tmp_path, monkeypatch):
         BadInput, match=r"arctic/s01/box_use_01/0000-0030: expected a hinge angle of 0 to 20 deg, got 45"
     ):
         object_motion(HandsOptions(clip=clips[0].clip_id, hinge_range="0:20"), project)
+
+
+def test_motions_for_a_clip_have_the_verb_derived_from_its_motion(tmp_path, monkeypatch, make_clip):
+    monkeypatch.chdir(tmp_path)
+    root = write_annotated(tmp_path / "data/embedded/toy", [make_clip(6, clip_id="toy/s1/0", verb=None)], points=64)
+    motion = object_motion(HandsOptions(clip="toy/s1/0"), ProjectData("embedded", ("toy",), HANDS))
+    assert motion.verb == load_annotated(root).verb("toy/s1/0")
+    assert motion.verb
 
 
 def test_a_refusal_says_from_where_positions_count_if_the_limits_of_a_urdf_exclude_zero(tmp_path, keys):
