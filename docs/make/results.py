@@ -30,7 +30,8 @@ CORRECTED = tuple(
 )
 HIDDEN = {
     "table1-study": CORRECTED,
-    "table1-arctic": (*CORRECTED, "texts"),
+    # Recorded test clips are farther from training clips than generated motions are (docs/results.md).
+    "table1-arctic": (*CORRECTED, "texts", "fid_frechet_train_paper", "fid_frechet_train_corrected"),
     "table2-grab": ("This project's metrics",),
 }
 PLACE = re.compile(r"<!--results:(?P<name>[\w-]+)-->\n.*?<!--end-->", re.DOTALL)
@@ -152,7 +153,7 @@ TABLES = {
             "mean-pose-at-object": "mean pose at the object",
             "manipnet": "ManipNet",
         },
-        ("contact F1", "Con", "Art", "Pen", "acceleration", "slip", "realism", "jitter", "joints"),
+        ("contact F1", "Con", "Art", "Pen", "acceleration", "slip", "jitter", "joints"),
         unranked=frozenset({RECORDED, "mean-pose-at-object", "manipnet"}),  # manipnet is given the wrists
     ),
     "arctic-windows": Table(
