@@ -251,7 +251,7 @@ class _Evaluator:
     """Measures all predictions of a reference clip."""
 
     annotated: AnnotatedStore
-    recordings: Store  # its clips, whole also if windows of them are evaluated
+    recordings: Store  # its clips, whole also if windows are evaluated
     store: Store  # of the predictions
     metrics: tuple[Metric, ...]
     samples: dict[str, list[tuple[int, str]]]  # number and id of the predictions, by reference id

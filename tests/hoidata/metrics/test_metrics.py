@@ -244,15 +244,15 @@ def test_realism_is_scored_only_above_the_table_of_the_recording(make_clip, pair
 
 
 def test_the_table_of_a_clip_that_is_cut_while_held_is_that_of_its_recording(make_clip, moved, tmp_path):
-    held = on_a_hand(make_clip)
+    carried = on_a_hand(make_clip)
     other_frame = np.diag([2.0, 2.0, 2.0, 1.0])
 
-    def clip(name, recording, height_m, source_from_world=held.source_from_world, plate="plate"):
+    def clip(name, recording, height_m, source_from_world=carried.source_from_world, plate="plate"):
         subject, low = name.split("/")[0], np.float32([0, 0, height_m])
-        model = replace(held.object.model, name=plate)
-        track = replace(held.object, model=model, translation_m=held.object.translation_m + low)
+        model = replace(carried.object.model, name=plate)
+        track = replace(carried.object, model=model, translation_m=carried.object.translation_m + low)
         names = {"clip_id": f"toy/{name}", "subject": subject, "sequence": recording}
-        return replace(moved(held, low), object=track, source_from_world=source_from_world, **names)
+        return replace(moved(carried, low), object=track, source_from_world=source_from_world, **names)
 
     clips = [clip("s1/0", "other", -0.5), clip("s2/0", "another", -0.6)]
     clips += [clip("s3/0", "cut", 0), clip("s3/1", "cut", 0.1)]  # only the second is above the table
@@ -265,8 +265,8 @@ def test_the_table_of_a_clip_that_is_cut_while_held_is_that_of_its_recording(mak
 
 
 def test_the_table_of_a_window_is_that_of_the_whole_recording(make_clip, tmp_path):
-    held = on_a_hand(make_clip)
-    rises = replace(held, object=replace(held.object, translation_m=held.object.translation_m.copy()))
+    carried = on_a_hand(make_clip)
+    rises = replace(carried, object=replace(carried.object, translation_m=carried.object.translation_m.copy()))
     rises.object.translation_m[:2, 2] -= 0.1
     clip = replace(rises, clip_id="toy/s3", subject="s3")
     root = write_annotated(tmp_path / "data", [clip], points=256)
