@@ -2,7 +2,7 @@
 
 ``actions.toml`` next to this file has one table of limits per verb: ``measure = [minimum, maximum]``. A motion shows
 the verb if all measures are within their limits. A table is used for a dataset if 90 % of the verb's training clips
-satisfy it. For other verbs, the limits are computed from the training clips.
+satisfy it. For other verbs, the limits are the usual range of the training clips, if it excludes an object at rest.
 """
 
 import tomllib
@@ -102,6 +102,7 @@ MEASURES = {
 }
 HAND_MEASURES = ("first_left", "first_right", "last_left", "last_right")  # a request states the hands, not the verb
 VERB_MEASURES = tuple(name for name in MEASURES if name not in HAND_MEASURES)
+AT_REST = dict.fromkeys(VERB_MEASURES, 0.0)
 MIN_CLIPS = 3  # of a verb, to compute its limits
 MIN_FRACTION_WITHIN = 0.9  # of a verb's training clips, to use its table of actions.toml
 MARGIN = 0.5  # standard deviations, added to the 1st and 99th percentile of the verb's clips
@@ -193,8 +194,8 @@ def _touching(touching: np.ndarray) -> dict[str, float]:
 class Actions:
     """Limits, usual ranges and centroids of the measures, by verb of a dataset."""
 
-    limits: Mapping[str, Limits]  # by verb, limits that a motion of the verb satisfies
-    learnt: Mapping[str, int]  # number of clips for verbs with computed limits; other limits are from actions.toml
+    limits: Mapping[str, Limits]  # by verb, limits that a motion of the verb satisfies and an object at rest does not
+    learnt: Mapping[str, int]  # number of clips for verbs with limits from clips; other limits are from actions.toml
     centroids: Mapping[str, np.ndarray]  # by verb, mean standardised measures of its training clips
     scale: Mapping[str, tuple[float, float]]  # by measure, mean and deviation (``MIN_DEVIATION`` or more) of all clips
     usual: Mapping[str, Limits] = field(default_factory=dict)  # by verb, ``usual_limits``
@@ -284,15 +285,14 @@ def learn_actions(
         column = np.array([clip[name] for clip in all_clips])
         if len(column) and np.isfinite(column).all():
             scale[name] = float(column.mean()), max(float(column.std()), MIN_DEVIATION[name.rpartition("_")[2]])
-    limits, learnt = dict[str, Limits](), dict[str, int]()
     usual = usual_limits(numbers, scale)
-    all_deviations = {name: deviation for name, (_, deviation) in scale.items()}
+    limits, learnt = dict[str, Limits](), dict[str, int]()
     for verb, clips in numbers.items():
         table = (written or {}).get(verb)
         if table is not None and np.mean([_within(clip, table) is True for clip in clips]) >= MIN_FRACTION_WITHIN:
             limits[verb] = table
-        elif verb in usual:
-            limits[verb], learnt[verb] = _bands(clips, all_deviations), len(clips)
+        elif verb in usual and not _within(AT_REST, usual[verb]):
+            limits[verb], learnt[verb] = usual[verb], len(clips)
     centroids = {verb: np.mean([_standardised(clip, scale) for clip in clips], 0) for verb, clips in numbers.items()}
     return Actions(limits=limits, learnt=learnt, centroids=centroids, scale=scale, usual=usual)
 
@@ -305,27 +305,18 @@ def usual_limits(
     The range is the 1st to the 99th percentile, widened by ``MARGIN`` deviations of the verb's clips. If these hardly
     differ, the deviation of all clips is used.
     """
-    return {
-        verb: _bands(clips, _verb_deviations(clips, scale))
-        for verb, clips in numbers.items()
-        if len(clips) >= MIN_CLIPS
-    }
+    limits = dict[str, Limits]()
+    for verb, clips in numbers.items():
+        if len(clips) >= MIN_CLIPS:
+            limits[verb] = {name: _range([clip[name] for clip in clips], of_all) for name, (_, of_all) in scale.items()}
+    return limits
 
 
-def _verb_deviations(clips: list[dict[str, float]], scale: Mapping[str, tuple[float, float]]) -> dict[str, float]:
-    deviations = {}
-    for name, (_, of_all_clips) in scale.items():
-        of_verb = float(np.std([clip[name] for clip in clips]))
-        deviations[name] = of_verb if of_verb > MIN_RELATIVE_DEVIATION * of_all_clips else of_all_clips
-    return deviations
-
-
-def _bands(clips: list[dict[str, float]], deviations: Mapping[str, float]) -> Limits:
-    bands = {}
-    for name, deviation in deviations.items():
-        low, high = np.percentile([clip[name] for clip in clips], (1, 99))
-        bands[name] = float(low - MARGIN * deviation), float(high + MARGIN * deviation)
-    return bands
+def _range(values: list[float], of_all_clips: float) -> tuple[float, float]:
+    of_verb = float(np.std(values))
+    deviation = of_verb if of_verb > MIN_RELATIVE_DEVIATION * of_all_clips else of_all_clips
+    low, high = np.percentile(values, (1, 99))
+    return float(low - MARGIN * deviation), float(high + MARGIN * deviation)
 
 
 def _within(numbers: Mapping[str, float], limits: Limits) -> bool | None:

@@ -69,11 +69,11 @@ def length_error_share(pair: Pair, frame_step: int) -> Values:
 
 
 def action_followed(pair: Pair, _frame_step: int) -> Values:
-    """(1,) 1 if the object's motion satisfies the rules of the verb, else 0; unmeasured for a verb without rules."""
+    """(1,) 1 if the object's motion satisfies the limits of the verb, else 0; unmeasured for a verb without limits."""
     if pair.verb is None:
         return NO_VERB
     if pair.actions is None or pair.verb not in pair.actions.limits:
-        return Unmeasured("no limits are known of the verb")
+        return Unmeasured("the verb has no limits that exclude an object at rest")
     followed = pair.actions.satisfies_limits(pair.verb, _action(pair))
     return NO_GRAVITY if followed is None else np.array([float(followed)])
 

@@ -188,7 +188,8 @@ METRICS: tuple[Metric, ...] = (
     Metric(
         "action_followed", motion.action_followed, topic="Action", title="rule-based verb success",
         direction="higher", frames="all",
-        thresholds="`actions.toml`, or training clips of the verb: 1st to 99th percentile and half a deviation",
+        thresholds="`actions.toml`, or training clips of the verb: 1st to 99th percentile and half a deviation, "
+        "if that excludes an object at rest",
         source=f"{OWN}: limits of height, path, tilt, hinge and hands (`hoidata/actions`)",
     ),
     Metric(

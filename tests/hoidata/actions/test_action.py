@@ -163,7 +163,7 @@ def test_measures_outside_the_usual_range_are_described_whatever_the_written_lim
     assert actions.violations("lift", numbers["lift"][0]) == {} == actions.violations("juggle", low)
 
 
-def test_usual_ranges_are_widened_by_the_verbs_deviation_and_limits_by_that_of_all_clips():
+def test_usual_ranges_are_widened_by_the_verbs_deviation_unless_its_clips_hardly_differ():
     still = numbers_of(track(np.zeros((30, 3))))
 
     def shakes(apart: float) -> list[dict[str, float]]:
@@ -176,11 +176,22 @@ def test_usual_ranges_are_widened_by_the_verbs_deviation_and_limits_by_that_of_a
         assert 1 < deviation == pytest.approx(actions.scale["reversals_per_s"][1])
         assert (verb_deviation > 0.25 * deviation) == uses_verb_deviation
         for verb, middle, half in (("shake", 2.5, 4.9 * apart), ("hold", 0, 0)):  # 1st and 99th percentile of eleven
-            usual = 0.5 * (verb_deviation if uses_verb_deviation and verb == "shake" else deviation)
-            learnt = 0.5 * deviation
-            bounds, limits = actions.usual[verb]["reversals_per_s"], actions.limits[verb]["reversals_per_s"]
-            assert bounds == pytest.approx((middle - half - usual, middle + half + usual))
-            assert limits == pytest.approx((middle - half - learnt, middle + half + learnt))
+            margin = 0.5 * (verb_deviation if uses_verb_deviation and verb == "shake" else deviation)
+            bounds = actions.usual[verb]["reversals_per_s"]
+            assert bounds == pytest.approx((middle - half - margin, middle + half + margin))
+
+
+def test_a_verb_has_limits_only_if_they_exclude_an_object_at_rest():
+    still = numbers_of(track(np.zeros((30, 3))))
+    clips = lifts_and_pours(0) | {"hold": [still] * 10}
+    actions = learn_actions(clips)
+    assert set(actions.limits) == {"lift", "pour"}
+    assert actions.limits == {verb: actions.usual[verb] for verb in ("lift", "pour")}
+    assert actions.satisfies_limits("lift", still) is False
+    assert actions.satisfies_limits("hold", still) is None
+    assert set(actions.usual) == set(actions.centroids) == {"lift", "pour", "hold"}
+    low = [numbers | {"rise_m": 0.01, "end_rise_m": 0.01, "path_m": 0.01} for numbers in clips["lift"]]
+    assert set(learn_actions(clips | {"lift": low}).limits) == {"pour"}
 
 
 def test_written_limits_are_used_if_the_training_clips_satisfy_them():
@@ -207,6 +218,8 @@ def test_the_limits_of_actions_toml_are_of_measures_and_distinguish_open_from_cl
     assert all(name in VERB_MEASURES and least <= most for name, (least, most) in limits)
     assert written["open"]["hinge_net_deg"][0] > 0 > written["close"]["hinge_net_deg"][1]
     assert written["hand over"]["hand_changes"] == (1, 2)
+    actions, still = Actions(written, {}, {}, {}), numbers_of(track(np.zeros((5, 3))))
+    assert not any(actions.satisfies_limits(verb, still) for verb in written)
 
 
 def test_each_verb_measure_has_a_text():
