@@ -60,9 +60,9 @@ def alphas_cumprod(device: torch.device | str = "cpu", schedule: Schedule = "cos
     return torch.tensor(alpha_bar_values(schedule)).to(device)
 
 
-def timesteps(steps: int) -> list[int]:
-    """The timesteps of a sampler: evenly spaced from the last of 1,000 down ("trailing", Lin et al. 2024)."""
-    return [round(TRAIN_STEPS * (1 - number / steps)) - 1 for number in range(steps)]
+def timesteps(steps: int, of: int = TRAIN_STEPS) -> list[int]:
+    """The timesteps of a sampler: evenly spaced from the last of ``of`` down ("trailing", Lin et al. 2024)."""
+    return [round(of * (1 - number / steps)) - 1 for number in range(steps)]
 
 
 def add_noise(clean: Tensor, noise: Tensor, steps: Tensor, alphas_bar: Tensor) -> Tensor:
@@ -114,12 +114,13 @@ def sample(
     config: SamplerConfig,
     generator: torch.Generator | list[torch.Generator],
     schedule: Schedule = "cosine",
+    of: int = TRAIN_STEPS,
 ) -> Tensor:
     """Samples from noise (B, ...), on its device; ``denoise(x, t)`` predicts the clean x at timesteps t (B,).
 
-    generator: of the noise that DDPM adds, one for the batch or one per sample.
+    generator: of the noise that DDPM adds, one for the batch or one per sample. of: steps to which x was noised.
     """
-    x, steps, alpha_bars = noise, timesteps(config.steps), alpha_bar_values(schedule)
+    x, steps, alpha_bars = noise, timesteps(config.steps, of), alpha_bar_values(schedule)
     previous_clean: Tensor | None = None
     for number, step in enumerate(steps):
         alpha_bar = alpha_bars[step]

@@ -140,7 +140,8 @@ class RefinedControl:
         features = hands, object_features(clip.object, *frame), contact_map[None].astype(np.float32)
         coarse, objects, contact = (torch.from_numpy(array)[None].to(self.model.device) for array in features)
         batch = collate_requests([request]).to(self.model.device)
-        moved = self.model.refine(batch, coarse, objects, contact, surface)[0]
+        generators = [torch.Generator().manual_seed(request.seed)]
+        moved = self.model.refine(batch, coarse, objects, contact, surface, generators)[0]
         refined = self.model.refined_clip(request, moved, objects[0]).hands.items()
         tracks = {side: replace(track, valid=clip.hands[side].valid) for side, track in refined if track.valid.any()}
         return replace(clip, hands={**clip.hands, **tracks})

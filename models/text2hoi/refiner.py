@@ -8,6 +8,9 @@ Text2HOI, Sec. 3.3 and supplement, Table S10: a Transformer over left- and right
 - The signed displacement to the surface is an input, since the attention map is the same inside and outside. The
   contact map and the points' norms are not.
 - The network predicts a correction that starts at zero, projected to splines so that it does not jitter.
+
+``output: diffusion`` is the rival refiner of the supplement's Table S1: a diffusion model that noises coarse hands
+halfway and denoises them, with the inputs of the paper's refiner as the condition.
 """
 
 from collections.abc import Iterable
@@ -19,6 +22,7 @@ from torch import Tensor, nn
 
 from hoidata.batches.requests import RequestBatch
 from hoidata.clips.features import HAND_FEATURES, HAND_ROTATIONS_6D, OBJECT_HINGE, OBJECT_POSITION, WRIST
+from hoidata.devices import send
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import POINT_COUNT
 from hoidata.objects.signed_distance_grid import DistanceFields
@@ -31,6 +35,7 @@ from models.common.features import (
     proper_hands,
     to_object_frame,
 )
+from models.common.sampling import SamplerConfig, add_noise, alphas_cumprod, sample
 from models.common.spline import projected
 from models.common.transformer import (
     Encoder,
@@ -48,6 +53,8 @@ REACH_M = 0.05
 WRIST_UNIT_M, ROTATION_UNIT = 0.05, 0.3  # corrections of the wrist and of 6D rotations for a network output of one
 KNOT_FRAMES = 4  # frames between the knots of a correction
 FIELD_RESOLUTION = 48  # points of the distance grids along each axis
+NOISE_STEPS = 500  # of 1,000, to which a diffusion model noises coarse hands
+DIFFUSION_SAMPLER = SamplerConfig()  # from there
 
 
 @dataclass(frozen=True)
@@ -55,8 +62,16 @@ class RefinerConfig:
     """Sizes and inputs of the refiner; the defaults are the paper's."""
 
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
-    # Predict the hands in the world, or a correction in the object's frame.
-    output: Literal["hands", "residual"] = "hands"
+    # Predict the hands in the world, a correction in the object's frame, or the hands in the world from noised ones.
+    output: Literal["hands", "residual", "diffusion"] = "hands"
+
+
+@dataclass(frozen=True)
+class NoisedHands:
+    """What a diffusion model denoises besides its condition."""
+
+    hands: Tensor  # (B, 2, F, 99) metres, model frame
+    steps: Tensor  # (B,) timesteps, below NOISE_STEPS
 
 
 @dataclass(frozen=True)
@@ -86,8 +101,12 @@ class RefinerModel(nn.Module):
     def __init__(self, config: RefinerConfig) -> None:
         super().__init__()
         self.config, self.is_residual = config, config.output == "residual"
+        self.is_diffusion = config.output == "diffusion"
         width, frames_per_token = config.transformer.width, config.transformer.frames_per_token
         inputs = HAND_FEATURES + 2 * JOINT_FEATURES + (JOINT_FEATURES + 21 if self.is_residual else 2 * POINT_COUNT)
+        if self.is_diffusion:
+            inputs += HAND_FEATURES
+            self.step_in = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
         self.hands_in = nn.ModuleList([nn.Linear(inputs * frames_per_token, width) for _ in range(2)])
         self.encoder = Encoder(config.transformer)
         self.hands_out = nn.ModuleList([nn.Linear(width, HAND_FEATURES * frames_per_token) for _ in range(2)])
@@ -99,24 +118,27 @@ class RefinerModel(nn.Module):
         reach[WRIST] = WRIST_UNIT_M if self.is_residual else 1.0
         self.register_buffer("reach", reach, persistent=False)
 
-    def forward(self, coarse: CoarseMotion) -> Tensor:
-        """Refined hands (B, 2, F, 99) in the world."""
-        hands = self.corrected(coarse)
+    def forward(self, coarse: CoarseMotion, noised: NoisedHands | None = None) -> Tensor:
+        """Refined hands (B, 2, F, 99) in the world; ``noised`` is what a diffusion model denoises."""
+        hands = self.corrected(coarse, noised)
         return hands_in_world(hands, coarse.object) if self.is_residual else hands
 
-    def corrected(self, coarse: CoarseMotion) -> Tensor:
+    def corrected(self, coarse: CoarseMotion, noised: NoisedHands | None = None) -> Tensor:
         """Refined hands (B, 2, F, 99) in the frame of ``in_view``.
 
         Absent hands and padding are masked; their outputs are meaningless.
         """
         frames_per_token, n_frames = self.config.transformer.frames_per_token, coarse.hands.shape[2]
         local = self.in_view(coarse.hands, coarse.object)
-        inputs = self._inputs(coarse, local) * coarse.present[..., None]
+        inputs = self._inputs(coarse, local)
+        inputs = (inputs if noised is None else torch.cat((inputs, noised.hands), -1)) * coarse.present[..., None]
         agents = [layer(to_tokens(inputs[:, side], frames_per_token)) for side, layer in enumerate(self.hands_in)]
         tokens = torch.stack(agents, 1)
         frame = torch.arange(tokens.shape[2], device=tokens.device) * frames_per_token
         width = self.config.transformer.width
         tokens = tokens + sinusoid(frame, width) + agent_codes(width, tokens.device)[:2, None]
+        if noised is not None:
+            tokens = tokens + self.step_in(sinusoid(noised.steps, width))[:, None, None]
         attention_mask = attention_mask_of(coarse.present, frames_per_token).flatten(1)
         # A clip without any present hand still needs one key to attend to; its result is masked anyway.
         attention_mask[:, 0] |= ~attention_mask.any(1)
@@ -153,9 +175,18 @@ class RefinerModel(nn.Module):
 
 
 @torch.no_grad()
-def refine(network: RefinerModel, coarse: CoarseMotion) -> Tensor:
-    """Refined hands (B, 2, F, 99), metres, with proper rotations."""
-    return proper_hands(network(coarse))
+def refine(network: RefinerModel, coarse: CoarseMotion, noise: Tensor | None = None) -> Tensor:
+    """Refined hands (B, 2, F, 99), metres, with proper rotations; noise: (B, 2, F, 99) for a diffusion model."""
+    if noise is None:
+        return proper_hands(network(coarse))
+    device = coarse.hands.device
+    last = torch.full((len(noise),), NOISE_STEPS - 1, device=device)
+    noised = add_noise(coarse.hands, send(noise, device), last, alphas_cumprod(device))
+
+    def denoise(hands: Tensor, steps: Tensor) -> Tensor:
+        return network(coarse, NoisedHands(hands, steps))
+
+    return proper_hands(sample(denoise, noised, DIFFUSION_SAMPLER, [], of=NOISE_STEPS))
 
 
 class Surface:

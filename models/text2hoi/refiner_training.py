@@ -13,11 +13,11 @@ from hoidata.devices import send
 from models.common import losses
 from models.common.corpus import Corpus, any_form
 from models.common.family import Network, Objective, Setup
-from models.common.sampling import TRAIN_STEPS
+from models.common.sampling import TRAIN_STEPS, add_noise, alphas_cumprod
 from models.text2hoi.contact_training import CONTACT, SampleContact, contact_sampler
 from models.text2hoi.diffusion import Condition, MotionGenerator
 from models.text2hoi.diffusion_training import DIFFUSION, Targets, motion_generator
-from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, Surface
+from models.text2hoi.refiner import NOISE_STEPS, CoarseMotion, NoisedHands, RefinerConfig, RefinerModel, Surface
 
 MAX_BATCH_SIZE = 32  # of generated motions
 COARSE_MOTIONS = 4  # per training clip
@@ -84,6 +84,7 @@ class RefinerObjective:
         self.frames = weights.frames
         self.generator, self.surface = generator, surface
         self.targets = Targets(generator.network.representation, generator.normaliser, device)
+        self.alphas_bar = alphas_cumprod(device)
         self.vertices = torch.arange(0, 778, VERTEX_STEP, device=device)
         random = torch.Generator().manual_seed(seed)
         train, held_out = list(corpus.train), corpus.held_out
@@ -101,17 +102,17 @@ class RefinerObjective:
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> dict[str, Tensor]:
         random, pools = np.random.default_rng(generator.initial_seed()), [self.pool[s.clip_id] for s in batch.samples]
         motions = [pool[random.integers(len(pool))] for pool in pools]
-        return self._losses(self.network, self._batch(batch, motions))
+        return self._losses(self.network, self._batch(batch, motions), generator)
 
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, RefinerModel)
         assert self.held_out is not None
-        return self._losses(network, self.held_out)["total"]
+        return self._losses(network, self.held_out, torch.Generator().manual_seed(0))["total"]
 
-    def _losses(self, network: RefinerModel, comparison: _Comparison) -> dict[str, Tensor]:
+    def _losses(self, network: RefinerModel, comparison: _Comparison, generator: torch.Generator) -> dict[str, Tensor]:
         batch, coarse, weights = comparison.batch, comparison.coarse, self.weights
-        refined = network(coarse)
+        refined = network(coarse, self._noised(comparison.target, generator) if network.is_diffusion else None)
         change = (network.in_view(refined, coarse.object) - comparison.target) / network.reach
         simple = losses.masked_mean(change.square(), coarse.present[..., None])
         simple = simple if network.is_residual else simple * change.shape[-1]
@@ -130,6 +131,12 @@ class RefinerObjective:
             contact = losses.surface_loss(joint_distance, present, batch.contact_threshold_m, unit_m)
         total = simple + weights.penetration_weight * penetration + weights.contact_weight * contact
         return {"total": total, "simple": simple, "penetration": penetration, "contact": contact}
+
+    def _noised(self, target: Tensor, generator: torch.Generator) -> NoisedHands:
+        """Recorded hands at random timesteps (Eq. 1)."""
+        steps = send(torch.randint(NOISE_STEPS, (len(target),), generator=generator), self.device)
+        noise = send(torch.randn(target.shape, generator=generator), self.device)
+        return NoisedHands(add_noise(target, noise, steps, self.alphas_bar), steps)
 
     def _distances(self, batch: ClipBatch, hands: Tensor, objects: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distances of some vertices (B, 2, K, V) and the joints (B, 2, K, 21) of hands in the chosen frames."""

@@ -177,7 +177,7 @@ class Text2Hoi(ReportsContact):
                 given = torch.stack([contact_maps[number].expand(2, -1) for number in numbers]).to(contact)
                 contact = given * batch.active_hands[..., None]
             coarse, objects = self.denoise(batch, [self.verb_of(request) for request in chosen], contact, generators)
-            hands = coarse if surface is None else self.refine(batch, coarse, objects, contact, surface)
+            hands = coarse if surface is None else self.refine(batch, coarse, objects, contact, surface, generators)
             for row, number in enumerate(numbers):
                 clip = self.refined_clip(requests[number], hands[row], objects[row])
                 points = touched(self.trained["contact"], contact[row].amax(0)) & (contact[row].amax(0) > 0)
@@ -206,11 +206,21 @@ class Text2Hoi(ReportsContact):
         noise = draw_each(representation.sizes(MAX_FRAMES), sizes, generators, representation.object_features)
         return self.generator.sample(Condition(batch, batch.text, verbs, contact), self.sampler, noise, generators)
 
-    def refine(self, batch: RequestBatch, hands: Tensor, objects: Tensor, contact: Tensor, surface: Surface) -> Tensor:
-        """Hands (B, 2, F, 99) of the refiner network."""
+    def refine(
+        self,
+        batch: RequestBatch,
+        hands: Tensor,
+        objects: Tensor,
+        contact: Tensor,
+        surface: Surface,
+        generators: Sequence[torch.Generator],
+    ) -> Tensor:
+        """Hands (B, 2, F, 99) of the refiner network; generators: one per motion, which a diffusion model uses."""
         network = self.trained["refiner"].network
         assert isinstance(network, RefinerModel)
-        return refine(network, surface.coarse(batch, hands, objects, contact.amax(1), batch.hand_frames))
+        coarse = surface.coarse(batch, hands, objects, contact.amax(1), batch.hand_frames)
+        longest, sizes = (MAX_FRAMES, 0), (hands.shape[2], 0)
+        return refine(network, coarse, draw_each(longest, sizes, generators)[0] if network.is_diffusion else None)
 
     def refined_clip(self, request: Request, hands: Tensor, objects: Tensor) -> Clip:
         """The clip of features (2, F, 99) and (F, 10), after contact refinement if it is chosen."""

@@ -173,7 +173,7 @@ def sampled(stored: dict[str, Checkpoint], sampler: SamplerConfig, requests: lis
     contact = model.sample_contact(batch, generators)
     hands, objects = model.denoise(batch, [None] * len(requests), contact, generators)
     surface = model.surface(requests)
-    assert model.refine(batch, hands, objects, contact, surface).shape == hands.shape
+    assert model.refine(batch, hands, objects, contact, surface, generators).shape == hands.shape
 
 
 def control_points_of_ours() -> None:

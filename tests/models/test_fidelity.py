@@ -23,7 +23,7 @@ from models.text2hoi.contact import ContactModel, contact_loss
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
 from models.text2hoi.diffusion_training import DiffusionLossConfig, DiffusionObjective
 from models.text2hoi.length import LengthModel, length_error
-from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, Surface, attention_map
+from models.text2hoi.refiner import CoarseMotion, NoisedHands, RefinerConfig, RefinerModel, Surface, attention_map
 from models.text2hoi.refiner_training import RefinerObjective
 from pipelines.stages.base import load_settings
 from pipelines.stages.train import TrainParams
@@ -285,9 +285,12 @@ class Exact(MotionGenerator):
 
 
 class Off(RefinerModel):
-    """A refiner that adds 0.001 to every number."""
+    """A refiner that adds 0.001 to every number, and keeps what it is given to denoise."""
 
-    def forward(self, coarse: CoarseMotion) -> Tensor:
+    noised: list[NoisedHands | None]
+
+    def forward(self, coarse: CoarseMotion, noised: NoisedHands | None = None) -> Tensor:
+        self.noised = [*getattr(self, "noised", []), noised]
         return coarse.hands + 0.001
 
 
@@ -314,11 +317,30 @@ def test_the_refiners_losses_follow_equations_8_and_9(annotated: AnnotatedStore)
     """Eq. 9 in the hands' 99 numbers, summed; eq. 8 with lambda_1 = 5."""
     network = Off(replace(spec("refiner").network, transformer=TransformerConfig(16, 1, 2, 16)))
     tested = refiner_objective(network, annotated)
-    terms = tested._losses(network, tested.held_out)
+    terms = tested._losses(network, tested.held_out, torch.Generator())
+    assert network.noised == [None]
     assert float(terms["simple"]) == pytest.approx(99 * 0.001**2, rel=1e-3)
     assert float(terms["contact"]) > 0
     total = terms["simple"] + terms["penetration"] + 5 * terms["contact"]
     assert float(terms["total"]) == pytest.approx(float(total), rel=1e-6)
+
+
+def test_a_diffusion_refiner_learns_from_recorded_hands_noised_as_in_equation_1(annotated: AnnotatedStore) -> None:
+    network = Off(RefinerConfig(transformer=TransformerConfig(16, 1, 2, 16), output="diffusion"))
+    tested = refiner_objective(network, annotated)
+    for seed in range(40):
+        tested._losses(network, tested.held_out, torch.Generator().manual_seed(seed))
+    steps = torch.stack([noised.steps for noised in network.noised])
+    assert 0 <= int(steps.min()) < 50
+    assert 450 < int(steps.max()) < 500
+    angle = ((steps.double().numpy() + 1) / 1000 + 0.008) / 1.008 * np.pi / 2  # cosine schedule
+    alpha_bar = (np.cos(angle) ** 2 / np.cos(0.008 / 1.008 * np.pi / 2) ** 2)[..., None, None, None]
+    hands = torch.stack([noised.hands for noised in network.noised]).double().numpy()
+    noise = (hands - np.sqrt(alpha_bar) * tested.held_out.target.double().numpy()) / np.sqrt(1 - alpha_bar)
+    assert noise.mean() == pytest.approx(0, abs=0.02)
+    assert noise.std() == pytest.approx(1, abs=0.02)
+    assert tested.validation(network) == tested.validation(network)
+    assert torch.equal(network.noised[-1].hands, network.noised[-2].hands)
 
 
 def test_the_refiner_reads_the_2273_numbers_of_section_12(batch: ClipBatch) -> None:

@@ -26,7 +26,7 @@ from models.common.transformer import (
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
 from models.text2hoi.length import LengthConfig, LengthModel, length_loss
 from models.text2hoi.motion_representation import MotionRepresentationConfig
-from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, Surface
+from models.text2hoi.refiner import CoarseMotion, NoisedHands, RefinerConfig, RefinerModel, Surface, refine
 
 SMALL = TransformerConfig(
     width=32, layers=2, heads=2, feed_forward=64, dropout=0.0, norm_first=True, frames_per_token=2
@@ -267,6 +267,44 @@ def test_a_refiner_starts_as_the_identity_and_every_parameter_learns(batch: Clip
     without = [name for name, p in model.named_parameters() if p.grad is None or not p.grad.abs().max() > 0]
     # A key bias shifts all scores of a query alike, so a softmax gives it no gradient; it lives inside a larger tensor.
     assert without == []
+
+
+class Constant(RefinerModel):
+    """A diffusion refiner that takes all hands for the same, and keeps what it is given to denoise."""
+
+    clean: Tensor
+    noised: list[NoisedHands]
+
+    def corrected(self, coarse: CoarseMotion, noised: NoisedHands | None = None) -> Tensor:
+        assert noised is not None
+        self.noised.append(noised)
+        return self.clean.expand_as(noised.hands)
+
+
+def test_a_diffusion_refiner_denoises_coarse_hands_from_the_middle_of_the_schedule(batch: ClipBatch) -> None:
+    model, coarse = Constant(RefinerConfig(SMALL, output="diffusion")), coarse_of(batch)
+    model.clean, model.noised = batch.hands[0, 0, 0], []
+    noise = noise_like(coarse, 0)
+    refined = refine(model, coarse, noise)
+    assert [int(noised.steps[0]) for noised in model.noised] == list(range(499, 0, -25))
+    angle, start = (500 / 1000 + 0.008) / 1.008 * math.pi / 2, 0.008 / 1.008 * math.pi / 2
+    signal = math.cos(angle) / math.cos(start)
+    expected = signal * coarse.hands + math.sqrt(1 - signal**2) * noise
+    torch.testing.assert_close(model.noised[0].hands, expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(refined[batch.present], model.clean.expand_as(refined)[batch.present], atol=1e-5, rtol=0)
+
+
+def test_a_diffusion_refiner_reads_coarse_and_noised_hands_and_their_timestep(batch: ClipBatch) -> None:
+    torch.manual_seed(0)
+    model, coarse = RefinerModel(RefinerConfig(SMALL, output="diffusion")).eval(), coarse_of(batch)
+    steps, other = torch.full((len(batch),), 10), replace(coarse, joints_m=coarse.joints_m + 0.1)
+    noised = NoisedHands(coarse.hands, steps)
+    moved, later = replace(noised, hands=coarse.hands + 0.1), replace(noised, steps=steps * 9)
+    first, *others = (
+        model(*inputs)[batch.present]
+        for inputs in ((coarse, noised), (coarse, moved), (coarse, later), (other, noised))
+    )
+    assert not any(torch.allclose(first, hands) for hands in others)
 
 
 @pytest.mark.parametrize("output", ["hands", "residual"])
