@@ -35,6 +35,7 @@ from models.registry import load_network
 from models.text2hoi.diffusion import MotionGenerator
 from models.text2hoi.generation import GeneratedMotion, Generator, MotionOptions
 from models.text2hoi.sampler import SamplingConfig
+from pipelines.command_inputs import stored_object
 from pipelines.generation import GenerationRequest, Models, generate_files
 from tests.models.toy import PARAMS, train
 
@@ -348,6 +349,27 @@ def test_own_meshes_get_the_axis_up_that_was_up_in_training(trained: Path, monke
     )
     assert generated.clip.object.model is z_up
     assert next(check for check in expected.verdict if check.name == "stands upright").passed is None
+
+
+@pytest.mark.parametrize("of_dataset", [False, True], ids=["user mesh", "object of the dataset"])
+def test_generate_takes_user_meshes_as_z_up_and_keeps_the_frame_of_dataset_objects(
+    of_dataset: bool,
+    request_for,
+    trained: Path,
+    annotated_root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Generator, "object_ups", {"a": [0.0, 1.0, 0.0]})
+    models = Models(trained, load_embedded_hands(), load_encoder("hash"), annotated_root / "clips")
+    request = request_for("Lift a box with the left hand.", models=models)
+    model = read_user_object(tmp_path / "box.stl").model
+    if of_dataset:
+        request = replace(request, object="box")
+        model = stored_object("box", annotated_root / "clips", models.hands)
+    generate_files(request, tmp_path / "out")
+    expected = generator(trained).generate(request.text, model, request.options, as_stored=of_dataset)[0].clip.object
+    np.testing.assert_array_equal(np.load(tmp_path / "out" / "motion.npz")["object_rotvec"], expected.rotvec)
 
 
 @pytest.mark.parametrize("name", ["steps", "batch", "validate_every", "micro_batches", "save_every"])

@@ -80,6 +80,24 @@ def test_a_verb_that_the_source_does_not_name_is_the_one_derived_from_motion(tmp
     assert derived is not None
 
 
+def test_annotated_verbs_replace_the_labels_in_the_description_and_in_sentences(tmp_path):
+    unlabelled, labelled = (
+        build_clip(6, seed=1, clip_id=f"toy/s1/{number}", verb=verb) for number, verb in enumerate((None, "lift"))
+    )
+    excluded = dict.fromkeys((unlabelled.clip_id, labelled.clip_id), "excluded from training")
+    root = write_annotated(tmp_path / "annotated", [unlabelled, labelled], points=64, excluded=excluded)
+    derived = load_annotated(root).verb(unlabelled.clip_id)
+    # This store was converted again with another label, after the annotation.
+    clips = [unlabelled, dataclasses.replace(labelled, verb="open")]
+    store = open_store(write_clips(tmp_path / "again" / "clips", clips))
+    shutil.copytree(root / "annotation", tmp_path / "again" / "annotation")
+    sentences = [Source(store).clip(clip_id).sentences for clip_id in store.ids]
+    assert sentences == [(f"{derived} the box",), ("lift the box",)]
+    export_store(store, "croissant", tmp_path / "out", progress=False)
+    (verbs,) = json.loads((tmp_path / "out" / "croissant.json").read_text())["rai:dataBiases"]
+    assert verbs.endswith(f"2 verbs; most frequent: lift (1), {derived} (1)")
+
+
 def test_spider_gets_tips_and_object_with_z_up_and_skips_unsupported_clips(store, exported):
     folder = exported["spider"]
     (path,) = folder.rglob("trajectory_keypoints.npz")
