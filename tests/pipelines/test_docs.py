@@ -141,14 +141,14 @@ def test_tables_of_results_are_those_of_their_files():
 
 def test_a_changed_file_of_results_changes_its_table_and_no_other_text(tmp_path, monkeypatch):
     arctic = json.loads((results.RESULTS / "arctic.json").read_text())
-    arctic["static"]["figures"]["action_followed"] = 0.4321
+    arctic["static"]["figures"]["contact_f1"] = 0.4321
     shutil.copytree(results.RESULTS, tmp_path, dirs_exist_ok=True)
     (tmp_path / "arctic.json").write_text(json.dumps(arctic))
     before = results.PAGES[1].read_text()
     monkeypatch.setattr(results, "RESULTS", tmp_path)
     changed = [line for line in results.filled(before).splitlines() if line not in before.splitlines()]
     assert len(changed) == 1
-    assert changed[0].startswith("| first frame, repeated | .43 |")
+    assert changed[0].startswith("| first frame, repeated | 0 [82] | .43 |")
 
 
 def test_a_cell_of_results_has_interval_and_measured_clips_and_the_best_is_bold():
