@@ -137,8 +137,10 @@ class PoseNetwork(nn.Module):
         def denoise(x: Tensor, steps: Tensor) -> Tensor:
             return layout.joined(self(layout.cut(x), steps.repeat_interleave(len(layout.starts)), windows, frames))
 
-        noise = torch.randn(1, len(condition), len(self.mean), generator=generator).to(device)
-        x = sample(denoise, noise, SamplerConfig("ddim", 20), [generator])[0]
+        def draw() -> Tensor:
+            return torch.randn(1, len(condition), len(self.mean), generator=generator).to(device)
+
+        x = sample(denoise, draw(), SamplerConfig("ddim", 20), draw)[0]
         return (x * self.std + self.mean).cpu().numpy().astype(np.float64)
 
 

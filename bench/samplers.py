@@ -17,7 +17,7 @@ from bench.harness import medians, show
 from hoidata.batches.requests import ObjectPoints, Request, collate_requests
 from hoidata.objects.model import ObjectModel
 from hoidata.settings import build_config
-from models.common.sampling import SamplerConfig, sample_motion
+from models.common.sampling import Motion, SamplerConfig, sample_motion
 from models.common.transformer import TransformerConfig
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
 from pipelines.params import load_yaml
@@ -99,9 +99,12 @@ def one_call(model: DiffusionModel, active: tuple[bool, bool], frames: int) -> C
 def motion_s(model: DiffusionModel, config: SamplerConfig) -> float:
     """Processor seconds of the denoising of one motion from fixed noise."""
     generator, (hand_points, object_points) = torch.Generator().manual_seed(0), model.representation.sizes(FRAMES)
-    hands = torch.randn(1, 2, hand_points, 99, generator=generator)
-    objects = torch.randn(1, object_points, model.representation.object_features, generator=generator)
+    shapes = (1, 2, hand_points, 99), (1, object_points, model.representation.object_features)
+
+    def draw() -> Motion:
+        return torch.randn(shapes[0], generator=generator), torch.randn(shapes[1], generator=generator)
+
     start = time.process_time()
     encoded = model.encode_condition(condition((True, True), FRAMES))
-    sample_motion(lambda *inputs: model.denoise(*inputs, encoded), (hands, objects), config, generator)
+    sample_motion(lambda *inputs: model.denoise(*inputs, encoded), draw, config)
     return time.process_time() - start

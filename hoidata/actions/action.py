@@ -102,7 +102,7 @@ MEASURES = {
 }
 HAND_MEASURES = ("first_left", "first_right", "last_left", "last_right")  # a request states the hands, not the verb
 VERB_MEASURES = tuple(name for name in MEASURES if name not in HAND_MEASURES)
-AT_REST = dict.fromkeys(VERB_MEASURES, 0.0)
+AT_REST = dict.fromkeys(VERB_MEASURES, 0.0)  # measures of an object that does not move, in the same hands
 MIN_CLIPS = 3  # of a verb, to compute its limits
 MIN_FRACTION_WITHIN = 0.9  # of a verb's training clips, to use its table of actions.toml
 MARGIN = 0.5  # standard deviations, added to the 1st and 99th percentile of the verb's clips
@@ -194,7 +194,7 @@ def _touching(touching: np.ndarray) -> dict[str, float]:
 class Actions:
     """Limits, usual ranges and centroids of the measures, by verb of a dataset."""
 
-    limits: Mapping[str, Limits]  # by verb, limits that a motion of the verb satisfies and an object at rest does not
+    limits: Mapping[str, Limits]  # by verb, limits that a motion of the verb satisfies
     learnt: Mapping[str, int]  # number of clips for verbs with limits from clips; other limits are from actions.toml
     centroids: Mapping[str, np.ndarray]  # by verb, mean standardised measures of its training clips
     scale: Mapping[str, tuple[float, float]]  # by measure, mean and deviation (``MIN_DEVIATION`` or more) of all clips

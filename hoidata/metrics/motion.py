@@ -73,7 +73,7 @@ def action_followed(pair: Pair, _frame_step: int) -> Values:
     if pair.verb is None:
         return NO_VERB
     if pair.actions is None or pair.verb not in pair.actions.limits:
-        return Unmeasured("the verb has no limits that exclude an object at rest")
+        return Unmeasured("the verb has too few training clips, or an object at rest is within their usual range")
     followed = pair.actions.satisfies_limits(pair.verb, _action(pair))
     return NO_GRAVITY if followed is None else np.array([float(followed)])
 

@@ -238,8 +238,12 @@ class BimArt:
             windows, weight = replace(windows, contact_m=layout.cut(contact_m)), self.config.sampler.guidance
             target = None if self.config.contact_guidance == "off" else self._contact_target(tasks, contact_m)
         denoise = self._denoiser(network, network.prepare(windows), layout, weight, target)
-        noise = torch.stack([torch.randn(frames, size, generator=generator) for generator in generators])
-        return sample(denoise, send(noise, self.device), self.config.sampler, generators, network.config.noise_schedule)
+
+        def draw() -> Tensor:
+            noise = torch.stack([torch.randn(frames, size, generator=generator) for generator in generators])
+            return send(noise, self.device)
+
+        return sample(denoise, draw(), self.config.sampler, draw, network.config.noise_schedule)
 
     def _contact_target(self, tasks: Sequence[SamplingTask], contact_m: Tensor) -> ContactTarget:
         points = torch.from_numpy(np.stack([task.scene.object_point_m for task in tasks])).to(self.device)

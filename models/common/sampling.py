@@ -60,9 +60,9 @@ def alphas_cumprod(device: torch.device | str = "cpu", schedule: Schedule = "cos
     return torch.tensor(alpha_bar_values(schedule)).to(device)
 
 
-def timesteps(steps: int, of: int = TRAIN_STEPS) -> list[int]:
-    """The timesteps of a sampler: evenly spaced from the last of ``of`` down ("trailing", Lin et al. 2024)."""
-    return [round(of * (1 - number / steps)) - 1 for number in range(steps)]
+def timesteps(steps: int, start: int = TRAIN_STEPS) -> list[int]:
+    """The timesteps of a sampler: evenly spaced from ``start - 1`` down ("trailing", Lin et al. 2024)."""
+    return [round(start * (1 - number / steps)) - 1 for number in range(steps)]
 
 
 def add_noise(clean: Tensor, noise: Tensor, steps: Tensor, alphas_bar: Tensor) -> Tensor:
@@ -94,17 +94,20 @@ def draw_each(
 
 @torch.no_grad()
 def sample_motion(
-    denoise: Denoise, noise: Motion, config: SamplerConfig, generator: torch.Generator | list[torch.Generator]
+    denoise: Denoise, draw: Callable[[], Motion], config: SamplerConfig, device: torch.device | str = "cpu"
 ) -> Motion:
-    """Motions (hands, object) from noise, on the noise's device; ``generator`` as in :func:`sample`."""
+    """Motions (hands, object) on ``device``.
+
+    draw: standard normal noise of both parts, which the motions start from and which DDPM adds.
+    """
+    noise = draw()
     shapes = noise[0].shape, noise[1].shape
 
     def denoise_both(x: Tensor, steps: Tensor) -> Tensor:
-        return torch.cat([part.flatten(1) for part in denoise(*_unflatten(x, *shapes), steps)], 1)
+        return _flat(denoise(*_unflatten(x, *shapes), steps))
 
-    return _unflatten(
-        sample(denoise_both, torch.cat([part.flatten(1) for part in noise], 1), config, generator), *shapes
-    )
+    clean = sample(denoise_both, send(_flat(noise), device), config, lambda: send(_flat(draw()), device))
+    return _unflatten(clean, *shapes)
 
 
 @torch.no_grad()
@@ -112,22 +115,23 @@ def sample(
     denoise: Callable[[Tensor, Tensor], Tensor],
     noise: Tensor,
     config: SamplerConfig,
-    generator: torch.Generator | list[torch.Generator],
+    draw: Callable[[], Tensor],
     schedule: Schedule = "cosine",
-    of: int = TRAIN_STEPS,
+    start: int = TRAIN_STEPS,
 ) -> Tensor:
     """Samples from noise (B, ...), on its device; ``denoise(x, t)`` predicts the clean x at timesteps t (B,).
 
-    generator: of the noise that DDPM adds, one for the batch or one per sample. of: steps to which x was noised.
+    noise: standard normal, or clean values noised by ``start`` steps. draw: standard normal noise (B, ...), which DDPM
+    adds in every step but the last.
     """
-    x, steps, alpha_bars = noise, timesteps(config.steps, of), alpha_bar_values(schedule)
+    x, steps, alpha_bars = noise, timesteps(config.steps, start), alpha_bar_values(schedule)
     previous_clean: Tensor | None = None
     for number, step in enumerate(steps):
         alpha_bar = alpha_bars[step]
         next_alpha_bar = alpha_bars[steps[number + 1]] if number + 1 < len(steps) else 1.0
         clean = denoise(x, torch.full((len(x),), step, device=x.device))
         if config.kind == "ddpm":
-            added_noise = _noise_like(x, generator) if next_alpha_bar < 1 else torch.zeros_like(x)
+            added_noise = draw() if next_alpha_bar < 1 else torch.zeros_like(x)
             x = _ddpm(x, clean, alpha_bar, next_alpha_bar, added_noise)
         elif config.kind == "ddim" or next_alpha_bar == 1:
             x = _ddim(x, clean, alpha_bar, next_alpha_bar)
@@ -174,10 +178,8 @@ def _half_log_ratio(alpha_bar: float) -> float:
     return 0.5 * math.log(alpha_bar / (1 - alpha_bar))
 
 
-def _noise_like(x: Tensor, generator: torch.Generator | list[torch.Generator]) -> Tensor:
-    if isinstance(generator, list):
-        return send(torch.stack([torch.randn(x.shape[1:], generator=each) for each in generator]), x.device)
-    return send(torch.randn(x.shape, generator=generator), x.device)
+def _flat(motion: Motion) -> Tensor:
+    return torch.cat([part.flatten(1) for part in motion], 1)
 
 
 def _unflatten(x: Tensor, hands_shape: tuple[int, ...], object_shape: tuple[int, ...]) -> Motion:

@@ -106,8 +106,7 @@ class Mdm(VectorSampler):
 
     def generate(self, requests: Sequence[Request], batch: RequestBatch, generators: list[torch.Generator]) -> Tensor:
         visible = feature_mask(batch.hand_frames, batch.frames)
-        noise = [torch.randn(MAX_FRAMES, MOTION_FEATURES, generator=generator) for generator in generators]
-        noise = send(torch.stack(noise)[:, : visible.shape[1]], self.device)
+        n_frames = visible.shape[1]
         text, network = torch.cat((batch.text, torch.zeros_like(batch.text))), self.checkpoint.network
 
         def denoise(motion: Tensor, steps: Tensor) -> Tensor:
@@ -115,7 +114,11 @@ class Mdm(VectorSampler):
             with_text, without = network(*inputs).chunk(2)
             return without + self.config.guidance * (with_text - without)
 
-        return self.decoded(sample(denoise, noise, self.config.sampler, generators))
+        def draw() -> Tensor:
+            noise = [torch.randn(MAX_FRAMES, MOTION_FEATURES, generator=generator) for generator in generators]
+            return send(torch.stack(noise)[:, :n_frames], self.device)
+
+        return self.decoded(sample(denoise, draw(), self.config.sampler, draw))
 
 
 def _load(sources: Sources) -> Mdm:

@@ -9,7 +9,7 @@ order that differs between objects. ``contact_tokens`` are points to attend to i
 spread over the surface, in metres. The result does not depend on the order of points.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -19,7 +19,6 @@ from torch import Tensor, nn
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import RequestBatch
 from hoidata.clips.features import HAND_FEATURES
-from hoidata.devices import send
 from hoidata.objects.sampling import POINT_COUNT
 from models.common.features import TEXT_FEATURES, Normaliser, proper_hands, proper_object, recentred, verb_one_hot
 from models.common.point_net import PointNet, PointNetConfig, normalised_points, spread_out
@@ -253,24 +252,17 @@ class MotionGenerator:
     normaliser: Normaliser
 
     @torch.no_grad()
-    def sample(
-        self,
-        condition: Condition,
-        sampler: SamplerConfig,
-        noise: Motion,
-        generator: torch.Generator | list[torch.Generator],
-    ) -> Motion:
+    def sample(self, condition: Condition, sampler: SamplerConfig, draw: Callable[[], Motion]) -> Motion:
         """Hands (B, 2, F, 99) and object (B, F, 10) in the model frame; the object starts at the origin.
 
-        noise: (B, 2, K, 99) and (B, L, 10 or 16). generator: of the noise that DDPM adds.
+        draw: standard normal noise (B, 2, K, 99) and (B, L, 10 or 16), as in ``sample_motion``.
         """
         encoded, device = self.network.encode_condition(condition), condition.text.device
 
         def denoise(hands: Tensor, objects: Tensor, timesteps: Tensor) -> Motion:
             return self.network.denoise(hands, objects, timesteps, encoded)
 
-        points = sample_motion(denoise, (send(noise[0], device), send(noise[1], device)), sampler, generator)
-        return self._features(points, condition)
+        return self._features(sample_motion(denoise, draw, sampler, device), condition)
 
     @torch.no_grad()
     def denoise_once(

@@ -9,11 +9,11 @@ Text2HOI, Sec. 3.3 and supplement, Table S10: a Transformer over left- and right
   contact map and the points' norms are not.
 - The network predicts a correction that starts at zero, projected to splines so that it does not jitter.
 
-``output: diffusion`` is the rival refiner of the supplement's Table S1: a diffusion model that noises coarse hands
-halfway and denoises them, with the inputs of the paper's refiner as the condition.
+``output: diffusion`` is the diffusion-based refiner of the supplement's Table S1: it noises coarse hands by half of the
+steps and denoises them, with the inputs of the paper's refiner as the condition.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -54,7 +54,7 @@ WRIST_UNIT_M, ROTATION_UNIT = 0.05, 0.3  # corrections of the wrist and of 6D ro
 KNOT_FRAMES = 4  # frames between the knots of a correction
 FIELD_RESOLUTION = 48  # points of the distance grids along each axis
 NOISE_STEPS = 500  # of 1,000, to which a diffusion model noises coarse hands
-DIFFUSION_SAMPLER = SamplerConfig()  # from there
+DIFFUSION_SAMPLER = SamplerConfig("ddim", 20)  # from step NOISE_STEPS to 0
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class RefinerConfig:
 
 @dataclass(frozen=True)
 class NoisedHands:
-    """What a diffusion model denoises besides its condition."""
+    """Noised hands at a timestep, an input of a diffusion model."""
 
     hands: Tensor  # (B, 2, F, 99) metres, model frame
     steps: Tensor  # (B,) timesteps, below NOISE_STEPS
@@ -124,10 +124,11 @@ class RefinerModel(nn.Module):
         return hands_in_world(hands, coarse.object) if self.is_residual else hands
 
     def corrected(self, coarse: CoarseMotion, noised: NoisedHands | None = None) -> Tensor:
-        """Refined hands (B, 2, F, 99) in the frame of ``in_view``.
+        """Refined hands (B, 2, F, 99) in the frame of ``in_view``; ``noised`` as in ``forward``.
 
         Absent hands and padding are masked; their outputs are meaningless.
         """
+        assert self.is_diffusion == (noised is not None)
         frames_per_token, n_frames = self.config.transformer.frames_per_token, coarse.hands.shape[2]
         local = self.in_view(coarse.hands, coarse.object)
         inputs = self._inputs(coarse, local)
@@ -175,18 +176,22 @@ class RefinerModel(nn.Module):
 
 
 @torch.no_grad()
-def refine(network: RefinerModel, coarse: CoarseMotion, noise: Tensor | None = None) -> Tensor:
-    """Refined hands (B, 2, F, 99), metres, with proper rotations; noise: (B, 2, F, 99) for a diffusion model."""
-    if noise is None:
+def refine(network: RefinerModel, coarse: CoarseMotion, draw: Callable[[], Tensor]) -> Tensor:
+    """Refined hands (B, 2, F, 99), metres, with proper rotations.
+
+    draw: standard normal noise (B, 2, F, 99), which only a diffusion model uses.
+    """
+    if not network.is_diffusion:
         return proper_hands(network(coarse))
     device = coarse.hands.device
-    last = torch.full((len(noise),), NOISE_STEPS - 1, device=device)
-    noised = add_noise(coarse.hands, send(noise, device), last, alphas_cumprod(device))
+    last = torch.full((len(coarse.hands),), NOISE_STEPS - 1, device=device)
+    noised = add_noise(coarse.hands, send(draw(), device), last, alphas_cumprod(device))
 
     def denoise(hands: Tensor, steps: Tensor) -> Tensor:
         return network(coarse, NoisedHands(hands, steps))
 
-    return proper_hands(sample(denoise, noised, DIFFUSION_SAMPLER, [], of=NOISE_STEPS))
+    refined = sample(denoise, noised, DIFFUSION_SAMPLER, lambda: send(draw(), device), start=NOISE_STEPS)
+    return proper_hands(refined)
 
 
 class Surface:

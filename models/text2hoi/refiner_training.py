@@ -63,7 +63,8 @@ class RefinerObjective:
 
     A coarse motion is a recorded clip that was noised and denoised once; the target is the recorded hands. For a
     network that predicts corrections, squared errors are averaged instead of summed, Eq. 10 and 11 are in centimetres,
-    and touching joints are pulled to their recorded distance instead of onto the surface.
+    and touching joints are pulled to their recorded distance instead of onto the surface. A diffusion model is also
+    given noised recorded hands.
     """
 
     entries = 0

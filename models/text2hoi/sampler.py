@@ -5,6 +5,7 @@ All random numbers of a motion come from its request's seed, so it does not depe
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -203,8 +204,9 @@ class Text2Hoi(ReportsContact):
         """Hands (B, 2, F, 99) and object (B, F, 10) in the model frame."""
         representation = self.generator.network.representation
         sizes = representation.sizes(batch.frames.shape[1])
-        noise = draw_each(representation.sizes(MAX_FRAMES), sizes, generators, representation.object_features)
-        return self.generator.sample(Condition(batch, batch.text, verbs, contact), self.sampler, noise, generators)
+        longest, features = representation.sizes(MAX_FRAMES), representation.object_features
+        draw = partial(draw_each, longest, sizes, generators, features)
+        return self.generator.sample(Condition(batch, batch.text, verbs, contact), self.sampler, draw)
 
     def refine(
         self,
@@ -219,8 +221,7 @@ class Text2Hoi(ReportsContact):
         network = self.trained["refiner"].network
         assert isinstance(network, RefinerModel)
         coarse = surface.coarse(batch, hands, objects, contact.amax(1), batch.hand_frames)
-        longest, sizes = (MAX_FRAMES, 0), (hands.shape[2], 0)
-        return refine(network, coarse, draw_each(longest, sizes, generators)[0] if network.is_diffusion else None)
+        return refine(network, coarse, lambda: draw_each((MAX_FRAMES, 0), (hands.shape[2], 0), generators)[0])
 
     def refined_clip(self, request: Request, hands: Tensor, objects: Tensor) -> Clip:
         """The clip of features (2, F, 99) and (F, 10), after contact refinement if it is chosen."""

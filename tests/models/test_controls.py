@@ -223,7 +223,7 @@ class Untracked:
 def test_a_refined_control_has_the_hands_of_the_refiner_and_the_recorded_object(sources, test, name, monkeypatch):
     """The refiner is replaced by one that lifts both hands by 1 cm."""
 
-    def lifted(network: RefinerModel, coarse: CoarseMotion, noise: None) -> torch.Tensor:
+    def lifted(network: RefinerModel, coarse: CoarseMotion, draw: object) -> torch.Tensor:
         return coarse.hands + torch.eye(99)[2] * 0.01
 
     monkeypatch.setattr("models.text2hoi.sampler.refine", lifted)

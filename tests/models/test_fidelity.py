@@ -328,11 +328,15 @@ def test_the_refiners_losses_follow_equations_8_and_9(annotated: AnnotatedStore)
 def test_a_diffusion_refiner_learns_from_recorded_hands_noised_as_in_equation_1(annotated: AnnotatedStore) -> None:
     network = Off(RefinerConfig(transformer=TransformerConfig(16, 1, 2, 16), output="diffusion"))
     tested = refiner_objective(network, annotated)
+    coarse = replace(tested.held_out.coarse, hands=tested.held_out.target + 0.3)
+    comparison = replace(tested.held_out, coarse=coarse)
     for seed in range(40):
-        tested._losses(network, tested.held_out, torch.Generator().manual_seed(seed))
+        terms = tested._losses(network, comparison, torch.Generator().manual_seed(seed))
+    assert float(terms["simple"]) == pytest.approx(99 * 0.301**2, rel=1e-3)
     steps = torch.stack([noised.steps for noised in network.noised])
     assert 0 <= int(steps.min()) < 50
     assert 450 < int(steps.max()) < 500
+    assert len(set(steps[0].tolist())) > 1
     angle = ((steps.double().numpy() + 1) / 1000 + 0.008) / 1.008 * np.pi / 2  # cosine schedule
     alpha_bar = (np.cos(angle) ** 2 / np.cos(0.008 / 1.008 * np.pi / 2) ** 2)[..., None, None, None]
     hands = torch.stack([noised.hands for noised in network.noised]).double().numpy()
@@ -341,6 +345,11 @@ def test_a_diffusion_refiner_learns_from_recorded_hands_noised_as_in_equation_1(
     assert noise.std() == pytest.approx(1, abs=0.02)
     assert tested.validation(network) == tested.validation(network)
     assert torch.equal(network.noised[-1].hands, network.noised[-2].hands)
+    train = list(Corpus.of(annotated, 0).train)
+    batch = collate(train, FrameSelection.drawn([clip.length for clip in train], 8, 0, np.random.default_rng(0)))
+    for seed in (0, 1):
+        tested.losses(batch, torch.Generator().manual_seed(seed))
+    assert not torch.equal(network.noised[-1].steps, network.noised[-2].steps)
 
 
 def test_the_refiner_reads_the_2273_numbers_of_section_12(batch: ClipBatch) -> None:

@@ -155,7 +155,7 @@ def test_swapped_sentences_swap_the_paths_of_the_object(learnt: Learnt) -> None:
         # The sentence and its length are swapped; the contact is not.
         counts = tuple(batch.counts[index] for index in order)
         swapped = condition(replace(batch, lengths=batch.lengths[order], counts=counts), order)
-        _, objects = learnt.generator.sample(swapped, SamplerConfig(), noise, generator)
+        _, objects = learnt.generator.sample(swapped, SamplerConfig(), lambda: noise)
         # The box is lifted along z or passed along x, by 20 cm.
         last = torch.stack([path[n - 1, :3] for path, n in zip(objects, batch.lengths[order], strict=True)])
         assert [int(end[2] < end[0]) for end in last] == verbs

@@ -285,7 +285,7 @@ def test_a_diffusion_refiner_denoises_coarse_hands_from_the_middle_of_the_schedu
     model, coarse = Constant(RefinerConfig(SMALL, output="diffusion")), coarse_of(batch)
     model.clean, model.noised = batch.hands[0, 0, 0], []
     noise = noise_like(coarse, 0)
-    refined = refine(model, coarse, noise)
+    refined = refine(model, coarse, lambda: noise)
     assert [int(noised.steps[0]) for noised in model.noised] == list(range(499, 0, -25))
     angle, start = (500 / 1000 + 0.008) / 1.008 * math.pi / 2, 0.008 / 1.008 * math.pi / 2
     signal = math.cos(angle) / math.cos(start)
@@ -307,9 +307,9 @@ def test_a_diffusion_refiner_reads_coarse_and_noised_hands_and_their_timestep(ba
     assert not any(torch.allclose(first, hands) for hands in others)
 
 
-@pytest.mark.parametrize("output", ["hands", "residual"])
+@pytest.mark.parametrize("output", ["hands", "residual", "diffusion"])
 def test_refined_hands_do_not_depend_on_padding_or_absent_hands(
-    batch: ClipBatch, output: Literal["hands", "residual"]
+    batch: ClipBatch, output: Literal["hands", "residual", "diffusion"]
 ) -> None:
     torch.manual_seed(0)
     model = RefinerModel(RefinerConfig(SMALL, output=output)).eval()
@@ -318,8 +318,11 @@ def test_refined_hands_do_not_depend_on_padding_or_absent_hands(
     coarse = coarse_of(batch)
     noise = noise_like(coarse, 0)
     other = replace(coarse, hands=torch.where(coarse.present[..., None], coarse.hands, noise))
+    noised = [NoisedHands(part.hands, torch.full((len(batch),), 10)) for part in (coarse, other)]
+    inputs = zip((coarse, other), noised if output == "diffusion" else (None, None), strict=True)
     with torch.no_grad():
-        assert torch.equal(model(coarse)[batch.present], model(other)[batch.present])
+        first, second = (model(*pair)[batch.present] for pair in inputs)
+    assert torch.equal(first, second)
 
 
 def noise_like(coarse: CoarseMotion, seed: int) -> Tensor:

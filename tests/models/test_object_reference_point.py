@@ -144,7 +144,7 @@ def test_a_generated_motion_does_not_depend_on_the_mesh_origin(batch: ClipBatch)
     for shift in (torch.zeros(3), SHIFT_M):
         shifted = replace(batch, points_m=batch.points_m + shift)
         condition = Condition(shifted, batch.text[:, 0], [None] * n, batch.contact)
-        hands, objects = generator.sample(condition, SamplerConfig(steps=2), noise, torch.Generator())
+        hands, objects = generator.sample(condition, SamplerConfig(steps=2), lambda: noise)
         at_old_origin = placed_at(objects, shift)
         start = at_old_origin[:, :1, OBJECT_POSITION]
         motions.append((hands[..., :3] - start[:, None], at_old_origin[..., OBJECT_POSITION] - start))

@@ -1,6 +1,7 @@
 """Samplers compared with closed forms and with diffusers; the cost of absent hands."""
 
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from typing import Any
 
@@ -13,9 +14,11 @@ from hoidata.batches.dataset import ClipBatch, collate
 from hoidata.errors import BadInput
 from models.common import sampling
 from models.common.sampling import (
+    Motion,
     SamplerConfig,
     alpha_bar_values,
     alphas_cumprod,
+    draw_each,
     sample,
     sample_motion,
     timesteps,
@@ -38,13 +41,17 @@ def gaussian_denoiser(mean: Tensor, spread: Tensor) -> Callable[[Tensor, Tensor]
     return denoise
 
 
+def like(noise: Tensor, generator: torch.Generator) -> Callable[[], Tensor]:
+    return lambda: torch.randn(noise.shape, generator=generator)
+
+
 def moments(kind: Any, steps: int, count: int = 40_000) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation of a sampler's output for the three Gaussians."""
     mean, spread = (torch.tensor(values, dtype=torch.float64) for values in (MEANS, SPREADS))
     generator = torch.Generator().manual_seed(0)
     half = torch.randn(count // 2, 3, generator=generator, dtype=torch.float64)
     noise = torch.cat((half, -half)) / half.square().mean(0).sqrt()  # mean 0 and spread 1, exactly
-    samples = sample(gaussian_denoiser(mean, spread), noise, SamplerConfig(kind, steps), generator)
+    samples = sample(gaussian_denoiser(mean, spread), noise, SamplerConfig(kind, steps), like(noise, generator))
     return samples.mean(0), samples.std(0, correction=0)
 
 
@@ -72,7 +79,7 @@ def test_another_schedule_than_the_denoisers_gives_other_moments(kind: Any) -> N
     denoise = gaussian_denoiser(mean, spread)
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(20_000, 3, generator=generator, dtype=torch.float64)
-    samples = sample(denoise, noise, SamplerConfig(kind, 50), generator, "linear")
+    samples = sample(denoise, noise, SamplerConfig(kind, 50), like(noise, generator), "linear")
     assert float((samples.std(0) / spread - 1).abs().max()) > 0.1
 
 
@@ -103,7 +110,7 @@ def test_every_step_is_that_of_diffusers(kind: Any, scheduler: str, more: dict) 
     for step in theirs.timesteps:
         more_noise = {} if kind == "ddim" else {"generator": generators[0]}
         x = theirs.step(torch.tanh(x), step, x, return_dict=False, **more_noise)[0]
-    samples = sample(lambda x, _: torch.tanh(x), noise, SamplerConfig(kind, 20), generators[1])
+    samples = sample(lambda x, _: torch.tanh(x), noise, SamplerConfig(kind, 20), like(noise, generators[1]))
     torch.testing.assert_close(samples, x, atol=2e-3 if kind == "ddpm" else 1e-4, rtol=0)
 
 
@@ -124,18 +131,21 @@ def test_a_perfect_denoiser_returns_the_clean_motion() -> None:
     truth = torch.randn(3, 2, 7, 99, generator=generator), torch.randn(3, 7, 10, generator=generator)
     for kind, steps in (("ddim", 1), ("ddim", 20), ("dpm++", 8), ("ddpm", 50)):
         config = SamplerConfig(kind, steps)  # pyright: ignore[reportArgumentType]
-        noise = torch.randn(truth[0].shape, generator=generator), torch.randn(truth[1].shape, generator=generator)
-        for denoised, true in zip(sample_motion(lambda *_: truth, noise, config, generator), truth, strict=True):
+        draw = partial(draw_each, (7, 7), (7, 7), [generator] * 3)
+        for denoised, true in zip(sample_motion(lambda *_: truth, draw, config), truth, strict=True):
             torch.testing.assert_close(denoised, true, atol=1e-4, rtol=0)
 
 
-def test_a_sample_with_its_generator_does_not_depend_on_the_batch() -> None:
-    denoise = gaussian_denoiser(torch.zeros(1), torch.ones(1))
-    config, noise = SamplerConfig("ddpm", 20), torch.ones(3, 1, dtype=torch.float64)
-    many = sample(denoise, noise, config, [torch.Generator().manual_seed(seed) for seed in (5, 6, 7)])
-    alone = sample(denoise, noise[:1], config, [torch.Generator().manual_seed(7)])
-    torch.testing.assert_close(many[2:], alone)
-    assert len({round(float(value), 6) for value in many}) == 3
+def test_a_ddpm_motion_depends_on_its_generator_and_not_on_the_other_motions_of_a_batch() -> None:
+    def motion(seeds: list[int], n_frames: int) -> Motion:
+        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+        draw = partial(draw_each, (60, 60), (n_frames, n_frames), generators)
+        return sample_motion(lambda *parts: (parts[0].tanh(), parts[1].tanh()), draw, SamplerConfig("ddpm", 20))
+
+    (hands, objects), (of_three, other_objects) = motion([7], 24), motion([5, 6, 7], 40)
+    torch.testing.assert_close(of_three[2:, :, :24], hands)
+    torch.testing.assert_close(other_objects[2:, :24], objects)
+    assert len({round(float(value), 6) for value in of_three[:, 0, 0, 0]}) == 3
 
 
 def small_model() -> DiffusionModel:
