@@ -24,10 +24,12 @@ from hoidata.store.store import open_store
 from models.baselines.retrieval import Prompt
 from models.common.family import Sources, motion_clip
 from models.common.predicting import PredictionConfig, requests_for, sample_family, spread
+from models.common.sampling import SamplerConfig
 from models.registry import family_names, load_family, load_network
 from models.text2hoi.contact_training import best_threshold, mean_f1
 from models.text2hoi.family import mean_map_by_position, other_prompts
-from models.text2hoi.sampler import Text2Hoi
+from models.text2hoi.refiner import RefinerModel
+from models.text2hoi.sampler import SamplingConfig, Text2Hoi
 from tests.builders.clips import build_clip
 from tests.builders.stores import write_annotated
 from tests.models.toy import FAST
@@ -199,6 +201,21 @@ def test_a_motion_does_not_depend_on_the_batch_and_depends_on_its_seed(sources: 
     (alone,) = family.sample(requests[:1])
     np.testing.assert_allclose(joints_of(alone), joints_of(together[0]), atol=1e-4)
     assert abs(joints_of(together[0]) - joints_of(together[1])).max() > 1e-3
+
+
+def test_a_motion_of_ddpm_and_a_diffusion_refiner_does_not_depend_on_the_batch(sources: Sources) -> None:
+    model = load_family("text2hoi").load(sources)
+    assert isinstance(model, Text2Hoi)
+    checkpoint = model.trained["refiner"]
+    torch.manual_seed(0)
+    refiner = RefinerModel(replace(checkpoint.network.config, output="diffusion")).eval()
+    trained = {**model.trained, "refiner": replace(checkpoint, network=refiner)}
+    model = replace(model, trained=trained, config=SamplingConfig(SamplerConfig("ddpm", 3)))
+    short = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=2))
+    together = model.sample([*short, replace(short[0], n_frames=short[0].n_frames + 9)])
+    (alone,) = model.sample(short[:1])
+    np.testing.assert_allclose(joints_of(alone), joints_of(together[0]), atol=1e-3)
+    assert abs(joints_of(together[0]) - joints_of(together[1])).max() > 1e-2
 
 
 def test_a_motion_depends_on_the_sentence_its_verb_and_refinement(
