@@ -24,7 +24,7 @@ from models.registry import load_network
 from models.text2hoi.contact_training import best_threshold, contact_probabilities, true_maps
 from models.text2hoi.diffusion import Condition, MotionGenerator
 from models.text2hoi.diffusion_training import Targets
-from models.text2hoi.refiner import RefinerModel, Surface
+from models.text2hoi.refiner import RefinerModel, Surface, refine
 from models.text2hoi.refiner_training import RefinerObjective, _Coarse, _Comparison
 from pipelines.stages.base import load_settings
 from pipelines.stages.train import TrainParams
@@ -229,6 +229,37 @@ def test_the_refiner_removes_four_fifths_of_added_noise(learnt: Learnt) -> None:
     )
     assert errors_m[0] == pytest.approx(0.01, rel=0.03)  # 10 mm, and the error of the motion representation
     assert errors_m[1] <= 0.2 * errors_m[0]
+
+
+@pytest.mark.long
+def test_a_diffusion_refiner_overfits_two_clips(learnt: Learnt) -> None:
+    if learnt.preset == "ours":
+        pytest.skip("the refiner of Table S1 belongs to preset `paper`")
+    clips, spec = (
+        learnt.clips,
+        TrainingSpec.of(load_network("refiner"), replace(DELIVERED, preset="paper").of("refiner")),
+    )
+    torch.manual_seed(0)
+    objective = RefinerObjective(
+        RefinerModel(replace(spec.network, output="diffusion")),
+        weights=replace(spec.loss, penetration_weight=0.0, contact_weight=0.0),
+        corpus=learnt.corpus,
+        generator=Planted(learnt.generator.network, learnt.generator.normaliser),
+        surface=Surface.of(learnt.hands, [clips[0].object_model], torch.device("cpu")),
+        device=torch.device("cpu"),
+        seed=0,
+        sample_contact=lambda batch, text, random: batch.contact.float(),
+    )
+    refiner = fit_quickly(objective, learnt.corpus, overfitting(spec.training, "refiner", "paper"))
+    comparison = objective._batch(collate(clips), [objective.pool[clip.clip_id][0] for clip in clips])
+    random = torch.Generator().manual_seed(3)
+    refined = refine(refiner, comparison.coarse, lambda: torch.randn(comparison.target.shape, generator=random))
+    before_m, after_m = (
+        float((hands - comparison.target)[..., WRIST].norm(dim=-1)[comparison.coarse.present].mean())
+        for hands in (comparison.coarse.hands, refined)
+    )
+    assert before_m == pytest.approx(0.01, rel=0.1)
+    assert after_m <= 0.5 * before_m
 
 
 def noisy(objective: RefinerObjective, generator: Planted, clips: list[ClipSample]) -> dict[str, list[_Coarse]]:
