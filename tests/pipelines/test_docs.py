@@ -148,7 +148,8 @@ def test_a_changed_file_of_results_changes_its_table_and_no_other_text(tmp_path,
     monkeypatch.setattr(results, "RESULTS", tmp_path)
     changed = [line for line in results.filled(before).splitlines() if line not in before.splitlines()]
     assert len(changed) == 1
-    assert changed[0].startswith("| first frame, repeated | 0 [82] | .43 |")
+    assert changed[0].startswith("| first frame, repeated |")
+    assert "| .43 |" in changed[0]
 
 
 def test_a_cell_of_results_has_interval_and_measured_clips_and_the_best_is_bold():
