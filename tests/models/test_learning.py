@@ -232,13 +232,10 @@ def test_the_refiner_removes_four_fifths_of_added_noise(learnt: Learnt) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("learnt", ["paper"], indirect=True)
 def test_a_diffusion_refiner_overfits_two_clips(learnt: Learnt) -> None:
-    if learnt.preset == "ours":
-        pytest.skip("the refiner of Table S1 belongs to preset `paper`")
-    clips, spec = (
-        learnt.clips,
-        TrainingSpec.of(load_network("refiner"), replace(DELIVERED, preset="paper").of("refiner")),
-    )
+    clips, settings = learnt.clips, replace(DELIVERED, preset=learnt.preset)
+    spec = TrainingSpec.of(load_network("refiner"), settings.of("refiner"))
     torch.manual_seed(0)
     objective = RefinerObjective(
         RefinerModel(replace(spec.network, output="diffusion")),
@@ -250,7 +247,7 @@ def test_a_diffusion_refiner_overfits_two_clips(learnt: Learnt) -> None:
         seed=0,
         sample_contact=lambda batch, text, random: batch.contact.float(),
     )
-    refiner = fit_quickly(objective, learnt.corpus, overfitting(spec.training, "refiner", "paper"))
+    refiner = fit_quickly(objective, learnt.corpus, overfitting(spec.training, "refiner", learnt.preset))
     comparison = objective._batch(collate(clips), [objective.pool[clip.clip_id][0] for clip in clips])
     random = torch.Generator().manual_seed(3)
     refined = refine(refiner, comparison.coarse, lambda: torch.randn(comparison.target.shape, generator=random))
