@@ -9,10 +9,10 @@ from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, collate
 from hoidata.batches.requests import RequestBatch
-from hoidata.contact.maps import f1_score
 from hoidata.devices import send
 from models.common.augmentation import scaled_contact
 from models.common.checkpoints import Checkpoint
+from models.common.contact_maps import THRESHOLDS, best_threshold, true_maps
 from models.common.corpus import Corpus, any_form
 from models.common.family import ClipObjective, Losses, Network, Objective, Setup
 from models.common.predicting import spread
@@ -29,24 +29,6 @@ ContactNetwork = ContactModel | AnchoredContact
 
 DEFAULT_THRESHOLD = 0.5  # without validation clips
 THRESHOLD_CLIPS = 100  # held-out clips that choose a threshold, at most
-THRESHOLDS = tuple(round(0.05 * step, 2) for step in range(1, 20))
-
-
-def mean_f1(probabilities: np.ndarray, true: np.ndarray, threshold: float) -> float:
-    """Mean over clips of the F1 of maps (clip, point), with probabilities cut at ``threshold``."""
-    pairs = zip(probabilities, true, strict=True)
-    return float(np.mean([f1_score(probability >= threshold, truth) for probability, truth in pairs]))
-
-
-def best_threshold(probabilities: np.ndarray, true: np.ndarray) -> float:
-    """The threshold among 0.05, 0.10, ... 0.95 with the best mean F1; the lowest if several are best."""
-    scores = [mean_f1(probabilities, true, threshold) for threshold in THRESHOLDS]
-    return THRESHOLDS[int(np.argmax(scores))]
-
-
-def true_maps(samples: list[ClipSample]) -> np.ndarray:
-    """(clip, point) bool contact maps."""
-    return np.stack([sample.contact_map for sample in samples])
 
 
 @torch.no_grad()

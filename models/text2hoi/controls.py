@@ -1,9 +1,6 @@
-"""Negative controls and retrieval baselines for Text2HOI.
+"""Negative controls for Text2HOI.
 
 A negative control is Text2HOI with one input replaced: a metric that does not change does not depend on that input.
-
-A retrieval baseline has no network: it retrieves a training clip of the same prompt or verb. With contact refinement it
-is the baseline of ``text2hoi-contact``.
 
 A refined control is a perturbed recording after the refiner network (Text2HOI, Fig. S6).
 """
@@ -20,10 +17,7 @@ from hoidata.batches.dataset import ClipSample
 from hoidata.batches.requests import Request, collate_requests
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.clips.features import hand_features, object_features
-from hoidata.hands import HandPair
-from hoidata.refinement import refine_grasps
 from models.baselines.controls import NOISE, PRESSED, PerturbedRecording
-from models.baselines.retrieval import PROMPT_LOOKUP, VERB_LOOKUP
 from models.common.family import Family, ReportsContact, Sampler, Skipped, Sources
 from models.text2hoi.family import NAMES, OtherPrompt, load_text2hoi, other_prompts
 from models.text2hoi.refiner import Surface
@@ -93,28 +87,6 @@ OTHER_PROMPT_OWN_CONTACT = _family(
     "Text2HOI, another clip's prompt, own contact map",
     lambda sources: OwnContact(OtherPrompt(load_text2hoi(sources), other_prompts(sources))),
 )
-
-
-@dataclass(frozen=True)
-class RefinedRetrieval:
-    """A retrieval baseline with contact refinement."""
-
-    retrieval: Sampler
-    pair: HandPair
-
-    def sample(self, requests: Sequence[Request]) -> list[Clip | Skipped]:
-        clips = self.retrieval.sample(requests)
-        return [refine_grasps(self.pair, clip) if isinstance(clip, Clip) else clip for clip in clips]
-
-
-def _refined(retrieval: Family) -> Family:
-    def load(sources: Sources) -> Sampler:
-        return RefinedRetrieval(retrieval.load(sources), sources.hands)
-
-    return Family(f"{retrieval.name}-refined", f"{retrieval.title}, contact refinement", load)
-
-
-PROMPT_RETRIEVAL_REFINED, VERB_RETRIEVAL_REFINED = _refined(PROMPT_LOOKUP), _refined(VERB_LOOKUP)
 
 
 @dataclass(frozen=True)

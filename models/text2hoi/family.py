@@ -10,8 +10,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from hoidata.annotation.encoders import TextEncoder, load_encoder, refuse_other_encoder
@@ -21,18 +19,15 @@ from hoidata.batches.requests import Request
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.settings import build_config
 from models.common.checkpoints import load_checkpoint
+from models.common.contact_maps import best_threshold, mean_f1, mean_maps, true_maps
 from models.common.family import Family, Figures, ReportsContact, Skipped, Sources
-from models.common.point_net import normalised_points
 from models.common.predicting import first_sentence
 from models.text2hoi.contact_training import (
     CONTACT,
     DEFAULT_THRESHOLD,
     ContactNetwork,
-    best_threshold,
     contact_probabilities,
     contact_threshold,
-    mean_f1,
-    true_maps,
 )
 from models.text2hoi.length import LENGTH, LengthModel
 from models.text2hoi.sampler import NETWORKS, SamplingConfig, Text2Hoi
@@ -78,40 +73,6 @@ def contact_metrics(
         "f1_mean_map_of_same_object": baselines["object"],
         "threshold": threshold,
     }
-
-
-def mean_maps(train: list[ClipSample], clips: list[ClipSample], kind: str) -> np.ndarray:
-    """Baseline contact maps (clip, point) from training clips.
-
-    kind: "index": the mean by point index. "position": the mean at the nearest points in coordinates normalised to the
-    object. "object": the mean over training clips of the same object, or over all if it is new.
-    """
-    train_maps = np.stack([sample.contact_map for sample in train]).astype(np.float64)
-    if kind == "index":
-        return np.repeat(train_maps.mean(axis=0)[None], len(clips), axis=0)
-    if kind == "object":
-        keys = np.array([sample.object_key for sample in train])
-        same = [train_maps[keys == sample.object_key] for sample in clips]
-        return np.stack([maps.mean(axis=0) if len(maps) else train_maps.mean(axis=0) for maps in same])
-    points = {sample.object_key: torch.from_numpy(sample.points.points_m)[None] for sample in [*train, *clips]}
-    clouds = {key: normalised_points(cloud)[0][0].numpy() for key, cloud in points.items()}
-    train_clouds = [clouds[sample.object_key] for sample in train]
-    of_object = {
-        key: mean_map_by_position(clouds[key], train_clouds, train_maps)
-        for key in {sample.object_key for sample in clips}
-    }
-    return np.stack([of_object[sample.object_key] for sample in clips])
-
-
-def mean_map_by_position(points: np.ndarray, train_clouds: list[np.ndarray], train_maps: np.ndarray) -> np.ndarray:
-    """Probability (point,) of contact at points (point, 3): the mean over training maps of their nearest points.
-
-    Points and training clouds (point, 3) are normalised to the size of their object; train_maps (clip, point).
-    """
-    probability = np.zeros(len(points))
-    for cloud, contact in zip(train_clouds, train_maps, strict=True):
-        probability += contact[KDTree(cloud).query(points)[1]]
-    return probability / max(len(train_maps), 1)
 
 
 def length_metrics(sources: Sources, train: list[ClipSample], test: list[ClipSample]) -> dict[str, float]:
@@ -223,8 +184,7 @@ class Estimated(ReportsContact):
 def hand_type_accuracy(sources: Sources) -> Figures:
     """Fraction of test clips whose hand type is estimated correctly from their first sentence."""
     test, model = sources.clips("test"), Estimated.load(sources)
-    hands = [model.model.choose_hand(sample.sentences[0], model.encoder).hand for sample in test]
-    correct = [hand == sample.hand_type for hand, sample in zip(hands, test, strict=True)]
+    correct = [model.model.choose_hand(clip.sentences[0], model.encoder).hand == clip.hand_type for clip in test]
     return {"hand_type": {"clips": len(test), "accuracy": round(float(np.mean(correct)), 6)}}
 
 

@@ -22,12 +22,12 @@ from hoidata.refinement import refine_grasps
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.store import open_store
 from models.baselines.retrieval import Prompt
+from models.common.contact_maps import best_threshold, mean_f1, mean_map_by_position
 from models.common.family import Sources, motion_clip
 from models.common.predicting import PredictionConfig, requests_for, sample_family, spread
 from models.common.sampling import SamplerConfig
 from models.registry import family_names, load_family, load_network
-from models.text2hoi.contact_training import best_threshold, mean_f1
-from models.text2hoi.family import mean_map_by_position, other_prompts
+from models.text2hoi.family import other_prompts
 from models.text2hoi.refiner import RefinerModel
 from models.text2hoi.sampler import SamplingConfig, Text2Hoi
 from tests.builders.clips import build_clip

@@ -15,13 +15,14 @@ from torch import Tensor, nn
 from hoidata.batches.dataset import ClipBatch, ClipSample, collate
 from hoidata.clips.features import WRIST
 from hoidata.contact.maps import f1_score
+from models.common.contact_maps import best_threshold, true_maps
 from models.common.corpus import Corpus
 from models.common.family import Network, Objective, Setup
 from models.common.features import Hands
 from models.common.sampling import Motion, SamplerConfig
 from models.common.training import TrainingConfig, TrainingSpec, fit
 from models.registry import load_network
-from models.text2hoi.contact_training import best_threshold, contact_probabilities, true_maps
+from models.text2hoi.contact_training import contact_probabilities
 from models.text2hoi.diffusion import Condition, MotionGenerator
 from models.text2hoi.diffusion_training import Targets
 from models.text2hoi.refiner import RefinerModel, Surface, refine
