@@ -139,8 +139,16 @@ def capsule_points(
     hands: CapsuleHands, rotmats: np.ndarray, wrist_m: np.ndarray, flexion_rad: np.ndarray, swing_rad: np.ndarray
 ) -> np.ndarray:
     """Return (hand, 21, 4, 3) points on the capsule axes, for hands rotated by (hand, 3, 3) about their wrists."""
-    local = finger_rotmats(hands, flexion_rad, swing_rad)
-    joints = hands.joints
+    starts, ends = _finger_axes(hands, flexion_rad, swing_rad)
+    palm = _palm_axes(hands.joints)
+    starts = np.concatenate([starts, np.stack([start for start, _ in palm], axis=1)], axis=1)
+    ends = np.concatenate([ends, np.stack([end for _, end in palm], axis=1)], axis=1)
+    return _placed_samples(starts, ends, rotmats, wrist_m)
+
+
+def _finger_axes(hands: CapsuleHands, flexion_rad: np.ndarray, swing_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return starts and ends (hand, 15, 3) of the finger capsules, before the rotation of the hand."""
+    local, joints = finger_rotmats(hands, flexion_rad, swing_rad), hands.joints
     at_rest = [*(joints[:, _KNUCKLES + segment] for segment in range(3)), hands.tips]
     bones = np.stack([end - start for start, end in pairwise(at_rest)], axis=2)
     rotation = np.broadcast_to(np.eye(3), (*bones.shape[:2], 3, 3))
@@ -149,11 +157,11 @@ def capsule_points(
         rotation = rotation @ local[:, :, segment]
         positions.append(positions[-1] + (rotation @ bones[:, :, segment, :, None])[..., 0])
     chain = np.stack(positions, axis=2)
-    starts = chain[:, :, :3].reshape(len(chain), 15, 3)
-    ends = chain[:, :, 1:].reshape(len(chain), 15, 3)
-    palm = _palm_axes(joints)
-    starts = np.concatenate([starts, np.stack([start for start, _ in palm], axis=1)], axis=1)
-    ends = np.concatenate([ends, np.stack([end for _, end in palm], axis=1)], axis=1)
+    return chain[:, :, :3].reshape(len(chain), 15, 3), chain[:, :, 1:].reshape(len(chain), 15, 3)
+
+
+def _placed_samples(starts: np.ndarray, ends: np.ndarray, rotmats: np.ndarray, wrist_m: np.ndarray) -> np.ndarray:
+    """Return (hand, capsule, 4, 3) points between starts and ends (hand, capsule, 3), rotated about the wrist."""
     fraction = np.linspace(0, 1, N_SAMPLES)[:, None]
     points = starts[:, :, None] + fraction * (ends - starts)[:, :, None]
     rotated = (points.reshape(len(points), -1, 3) @ rotmats.transpose(0, 2, 1)).reshape(points.shape)
@@ -273,23 +281,28 @@ def close_fingers(field: Field, hands: CapsuleHands, placement: Placement) -> tu
     wrist = put_over(field, hands, placement)
     flexion = np.broadcast_to(OPEN_RAD, (len(wrist), N_FINGERS, 3)).copy()
     stopped = np.zeros(flexion.shape, dtype=bool)
+    rows = np.arange(len(wrist))  # hands with a segment that still moves
     for _ in range(_LARGEST_STEPS):
-        clearance = _finger_clearance(field, hands, placement, wrist, flexion)
-        stopped |= clearance <= -PRESS_M
+        clearance = _finger_clearance(field, hands.take(rows), placement.take(rows), wrist[rows], flexion[rows])
+        stopped[rows] |= clearance <= -PRESS_M
         # A stopped segment also stops all joints between itself and the palm.
-        free = ~np.logical_or.accumulate(stopped[..., ::-1], axis=-1)[..., ::-1] & (flexion < LIMITS_RAD - 1e-9)
-        if not free.any():
+        free = ~np.logical_or.accumulate(stopped[rows, :, ::-1], axis=-1)[..., ::-1]
+        free &= flexion[rows] < LIMITS_RAD - 1e-9
+        is_moving = free.any((1, 2))
+        rows, free, clearance = rows[is_moving], free[is_moving], clearance[is_moving]
+        if not len(rows):
             break
         # All segments from the first free joint to the tip move.
         moves = np.logical_or.accumulate(free, axis=-1)
         nearest = np.where(moves, clearance + PRESS_M, np.inf).min(-1, keepdims=True)
         step = np.clip(0.9 * nearest / 0.10, 0.006, 0.10)
-        flexion = np.minimum(np.where(free, flexion + step * CURL_RATIO, flexion), LIMITS_RAD)
+        flexion[rows] = np.minimum(np.where(free, flexion[rows] + step * CURL_RATIO, flexion[rows]), LIMITS_RAD)
     return wrist, flexion
 
 
 def _finger_clearance(
     field: Field, hands: CapsuleHands, placement: Placement, wrist: np.ndarray, flexion: np.ndarray
 ) -> np.ndarray:
-    points = capsule_points(hands, placement.rotmats, wrist, flexion, placement.spread_rad)[:, :15]
+    starts, ends = _finger_axes(hands, flexion, placement.spread_rad)
+    points = _placed_samples(starts, ends, placement.rotmats, wrist)
     return (field(points).min(-1) - hands.radii[:, :15]).reshape(-1, N_FINGERS, 3)
