@@ -17,15 +17,21 @@ demo: $(VENV)/.installed
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
 
+# pip compiles packages on one core; compileall uses all. It fails on templates that are not Python: they stay as they are.
+PIP_OPTIONS := --quiet --no-compile -c constraints.txt
+COMPILE := $(VENV)/bin/python -m compileall -qq -j 0 $(VENV)/lib || true
+
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install --quiet -c constraints.txt -e .
+	$(VENV)/bin/pip install $(PIP_OPTIONS) -e .
+	$(COMPILE)
 	touch $@
 
 # One call for all packages: two would resolve them twice.
 $(VENV)/.installed-dev: pyproject.toml constraints.txt
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install --quiet -c constraints.txt -e '.[test,dev,docs]'
+	$(VENV)/bin/pip install $(PIP_OPTIONS) -e '.[test,dev,docs]'
+	$(COMPILE)
 	touch $(VENV)/.installed $@
 
 # The documentation as a site in build/site; strict: no dead link, nothing left out.
