@@ -70,7 +70,7 @@ def test_a_project_of_the_wheel_gives_the_bytes_of_a_clone(python, tmp_path, sma
         assert json.loads((project / name).read_text()) == digests, name
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_packages_of_the_user_called_models_and_pipelines_stay_theirs(python, tmp_path):
     for name in ("models", "pipelines"):
         (tmp_path / name).mkdir()

@@ -77,6 +77,7 @@ def digests(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): sha256_file(path) for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.long
 def test_a_cluster_makes_the_store_and_contact_of_one_local_process(corpus, hands, on_cluster, tmp_path, monkeypatch):
     monkeypatch.chdir(corpus)  # relative paths are relative to the client's folder
     convert_dataset(GrabAdapter(), "raw", hands, tmp_path / "clips", progress=False)
@@ -101,6 +102,7 @@ def test_a_sequence_that_ends_each_worker_is_quarantined_and_the_others_are_not(
     assert "several workers" in quarantined.got
 
 
+@pytest.mark.long
 def test_other_users_of_the_machine_cannot_connect_to_a_local_cluster():
     workers.choose_workers("dask")
     try:

@@ -136,7 +136,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("code", "count"), [(WORKERS, 2), (POOL, 1)], ids=["workers", "pool of adapters check"])
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
 def test_worker_processes_end_with_their_parent(tmp_path, code, count, sent):

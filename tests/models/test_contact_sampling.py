@@ -126,7 +126,7 @@ def test_an_outlier_is_never_the_medoid() -> None:
     assert torch.equal(most_typical(odd[None, None])[0], odd)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_anchored_network_learns_two_modes(batch: ClipBatch) -> None:
     """One object and sentence: touched at the top in half of the clips and at the bottom in the others."""
     torch.manual_seed(0)

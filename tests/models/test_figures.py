@@ -36,6 +36,7 @@ def subject(annotated: AnnotatedStore, trained: Path, tmp_path: Path, monkeypatc
     return Subject(annotated, annotated.ids("test")[0], generator, paths, ("mean-motion", "mean-pose", "ground-truth"))
 
 
+@pytest.mark.long
 def test_each_page_holds_its_motions(subject):
     pages = {path.stem: path.read_text() for path in write_pages(Path("pages"), subject)}
     left, right, both = (f"Lift a box with {words}." for words in ("the left hand", "the right hand", "both hands"))

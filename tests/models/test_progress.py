@@ -75,7 +75,7 @@ def out(trained: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_training_killed_three_times_writes_the_bytes_of_an_undisturbed_one(

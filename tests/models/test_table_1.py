@@ -447,7 +447,7 @@ BUDGETS = {
 }  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["mdm", "imos", "t2m"])
 def test_a_family_learns_two_clips_by_heart(name: str, tmp_path: Path) -> None:
     two, family, trained = two_clips(tmp_path), load_family(name), {}

@@ -39,7 +39,7 @@ def is_alive(pid: int) -> bool:
         return False
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_process_of_a_team_outlives_its_parent(tmp_path: Path) -> None:
     command, root = [sys.executable, "-c", PARENT, str(tmp_path)], Path(__file__).parents[2]
     parent = subprocess.Popen(command, cwd=root, env={**os.environ, "PYTHONPATH": str(root)})

@@ -293,6 +293,7 @@ def test_an_open_mesh_and_a_repaired_one_are_reported(request_for, tmp_path: Pat
     }
 
 
+@pytest.mark.long
 def test_visible_differences_are_reported_and_the_page_has_the_others(
     request_for, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

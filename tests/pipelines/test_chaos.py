@@ -369,6 +369,7 @@ def test_a_missing_entry_of_a_json_file_is_reported_with_its_name_and_the_file(b
             open_store(path.parents[1])
 
 
+@pytest.mark.long
 def test_file_names_that_are_not_utf_8_give_a_message_instead_of_a_traceback(built, typed, tmp_path):
     for words in (["validate"], ["lineage"], ["generate", "Lift it.", "--out", "out", "--object"])[not IS_CHAOS :]:
         done = typed("hoidata", *words, os.fsdecode(b"b\xffd.obj"))

@@ -70,7 +70,7 @@ def test_only_modules_with_a_choice_import_dynamically(code):
     assert modules == {"hoidata/datasets/registry.py"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["convert/manipnet", "train/refiner", "report"])
 def test_importing_a_closure_loads_no_file_outside_of_it(code, name):
     files = [path for path in code[f"code/{name}.json"] if path.endswith(".py")]

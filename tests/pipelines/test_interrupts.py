@@ -15,6 +15,8 @@ import pytest
 from tests.hoidata.test_lifetime import is_at_work, until
 from tests.pipelines.test_parallel_repro import PROJECT, tiny_project
 
+pytestmark = pytest.mark.long
+
 MARK = "HOIDATA_TEST_RUN"  # an environment variable that all processes of a run inherit
 MOMENTS = range(2 * int(os.environ.get("HOIDATA_CHAOS", "1")))
 STUBBORN = """
@@ -92,7 +94,6 @@ def stubborn_run(folder: Path, **options) -> Run:
     return run
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_a_run_kills_a_stage_that_ignores_signals(stubborn_project, sent):
     run = stubborn_run(stubborn_project)
@@ -102,7 +103,6 @@ def test_a_run_kills_a_stage_that_ignores_signals(stubborn_project, sent):
     assert "Traceback" not in run.log.read_text()
 
 
-@pytest.mark.slow
 def test_a_second_ctrl_c_ends_a_run_at_once(stubborn_project):
     run = stubborn_run(stubborn_project)
     start = time.monotonic()
@@ -113,7 +113,6 @@ def test_a_second_ctrl_c_ends_a_run_at_once(stubborn_project):
     assert time.monotonic() - start < 4
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGKILL])
 def test_the_stages_of_a_run_in_the_background_of_a_script_end_with_it(stubborn_project, sent):
     """Commands that a script starts with `&` ignore Ctrl-C."""
@@ -155,7 +154,6 @@ def test_a_stage_ends_with_the_dvc_that_runs_it(tmp_path, shell, killed):
         dvc.stdout.close()
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("moment", MOMENTS)
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("words", [("hoidata", "repro"), ("hoidata", "synth", "write", "grab")], ids=" ".join)

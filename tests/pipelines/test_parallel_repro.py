@@ -220,7 +220,7 @@ def test_a_run_equals_dvc_repro_and_a_second_run_does_nothing(tmp_path):
     assert "made b.out" in log_of("b").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_failure_is_reported_with_its_output_and_existing_outputs_stay(tmp_path, capfd):
     tiny_project(tmp_path)
     reproduce_in_parallel([], jobs=2)

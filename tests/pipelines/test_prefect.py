@@ -89,7 +89,7 @@ except Exception as error:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("guarded", [True, False])
 def test_a_stored_result_is_never_unpickled(tmp_path, guarded):
     """Without the plugin that prefect.toml enables, the result is unpickled and its code runs."""

@@ -44,7 +44,7 @@ SOCKETS = (
     "work_pools/local/workers/connect",
 )
 ENDED = {"COMPLETED", "FAILED", "CRASHED", "CANCELLED"}
-pytestmark = pytest.mark.first
+pytestmark = [pytest.mark.first, pytest.mark.long]
 
 
 def mode(path: Path) -> int:
@@ -230,7 +230,6 @@ def attack_path(up) -> str:
     return f"/deployments/{up.deployment}/create_flow_run"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["application/json", "text/plain", "application/x-www-form-urlencoded", None])
 def test_requests_that_a_page_can_send_from_a_browser_are_refused(up, kind):
     headers = {"Origin": FOREIGN, **({"Content_Type": kind} if kind else {})}
@@ -240,7 +239,6 @@ def test_requests_that_a_page_can_send_from_a_browser_are_refused(up, kind):
     assert_nothing_came_of_it(up)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("origin", [FOREIGN, "null", "http://127.0.0.1:9", "http://localhost:4200"])
 def test_preflight_grants_no_other_origin(up, origin):
     headers = {"Access_Control_Request_Method": "POST", "Access_Control_Request_Headers": "authorization,content-type"}
@@ -249,7 +247,6 @@ def test_preflight_grants_no_other_origin(up, origin):
     assert "Access-Control-Allow-Origin" not in refused.headers
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("host", ["evil.example", "evil.example/api/health", "localhost"])
 def test_a_rebound_name_gets_nothing_without_the_key(up, host):
     assert ask(up, "GET", "/csrf-token?client=page", Host=host).status == 401
@@ -257,7 +254,6 @@ def test_a_rebound_name_gets_nothing_without_the_key(up, host):
     assert_nothing_came_of_it(up)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("key", [None, "hoidata:guess", ""])
 def test_only_the_health_check_answers_without_the_key(up, key):
     """All paths and methods of the API, with a valid CSRF token, so that only the key is missing."""
@@ -269,7 +265,6 @@ def test_only_the_health_check_answers_without_the_key(up, key):
     assert answered == {"/health", "/ready"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("path", SOCKETS)
 @pytest.mark.parametrize("hello", ["auth with a guess", "no auth", "no subprotocol"])
 def test_sockets_close_without_the_key(up, path, hello):
@@ -289,7 +284,6 @@ def test_sockets_close_without_the_key(up, path, hello):
         hear()
 
 
-@pytest.mark.slow
 def test_files_of_the_server_are_readable_by_the_owner_only(up):
     state = up.project / ".prefect"
     assert mode(state) == 0o700
@@ -298,7 +292,6 @@ def test_files_of_the_server_are_readable_by_the_owner_only(up):
     assert ".prefect/api-key" in up.log.read_text()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["http", "file"])
 def test_a_hostile_page_in_chromium_runs_nothing_and_reads_nothing(up, scheme, tmp_path):
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
@@ -368,7 +361,6 @@ def report_of(chromium: str, url: str, folder: Path, posted: queue.Queue) -> dic
         process.wait(30)
 
 
-@pytest.mark.long
 def test_a_deployment_started_in_the_folder_runs_and_is_the_only_run(up, project_tools):
     """It runs after the tests above, so that any run they started would have had time to appear.
 
@@ -394,7 +386,6 @@ def ended_runs(up) -> list[dict]:
     return runs()
 
 
-@pytest.mark.long
 def test_a_run_cannot_set_command_environment_or_folder_even_with_the_key(up):
     """A worker of a work pool would obey these fields; the process that serves the flows ignores them."""
     harm = f"touch {up.marker}"
@@ -407,7 +398,6 @@ def test_a_run_cannot_set_command_environment_or_folder_even_with_the_key(up):
     assert not up.marker.exists()
 
 
-@pytest.mark.slow
 def test_the_flow_and_what_started_it_end_with_the_server(up, project_tools):
     """The last test. Otherwise the next server at the port could control them."""
     engine = running_engine(up.project, project_tools, up)

@@ -45,7 +45,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_key_per_family_leads_to_metrics_of_all_methods(project: Path) -> None:
     stages = {name.partition("@")[0] for name in read_graph(project) if name.startswith("models/")}
     expected = {f"models/{folder}/dvc.yaml:{stage}" for folder in FOLDERS for stage in ("train", "sample")}

@@ -205,7 +205,7 @@ for path in sorted(path for path in folder.rglob("*") if path.is_file()):
 
 
 @needs_avx2
-@pytest.mark.slow
+@pytest.mark.long
 def test_data_do_not_depend_on_the_matrix_kernels_of_torch(tmp_path: Path) -> None:
     outputs = []
     for kernels in ("AUTO", "COMPATIBLE"):

@@ -46,6 +46,7 @@ def test_the_known_hand_is_found_and_every_sentence_names_it_alone(dataset: str,
             assert [name for name, form in NAMED.items() if re.search(form, sentence, re.I)] == [truth.hand_type]
 
 
+@pytest.mark.long
 def test_arctic_without_descriptions_gets_verb_and_hand_from_the_motion(small_corpus, tmp_path: Path) -> None:
     """Whole sequences have neither word nor hand; those with one action only are named for it."""
     corpus, adapter = small_corpus("arctic"), get_adapter("arctic", clips="whole")

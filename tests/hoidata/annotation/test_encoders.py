@@ -99,7 +99,7 @@ def test_an_unknown_encoder_is_refused(name: str) -> None:
         load_encoder(name)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("threads", ["1", "2"])
 def test_features_are_the_same_on_any_number_of_processors(threads: str) -> None:
     code = "import sys; from hoidata.annotation.encoders import load_encoder as f; "

@@ -49,7 +49,7 @@ def test_every_sentence_of_a_recorded_pair_reads_back(dataset, count: int) -> No
                 assert (reading.verb, reading.object_words, reading.hand.hand) == (verb, noun, hand), sentence
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_all_prompts_over_all_verbs_objects_and_hands_read_back() -> None:
     assert len(PAIRS) == 8 * 11 + 29 * 51 + 11 * 11
     hand, noun_accuracy, verb = shares(english_sentences)
@@ -58,7 +58,7 @@ def test_all_prompts_over_all_verbs_objects_and_hands_read_back() -> None:
     assert verb >= 0.99
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_references_forms_read_back_but_for_the_sizes_they_leave_out() -> None:
     """ "cube" may be any of three; every other object, hand and verb is read."""
     sized = {

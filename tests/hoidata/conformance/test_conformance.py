@@ -94,7 +94,7 @@ def partial_run(site: Path) -> Callable[..., subprocess.CompletedProcess]:
     return lambda *words: subprocess.run([*command, *words], capture_output=True, text=True, env=environment)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["arctic", "grab", "h2o"])
 def test_a_built_in_adapter_keeps_every_rule_on_its_embedded_corpus(name: str, small_corpus) -> None:
     findings = check_adapter(get_adapter(name), small_corpus(name).raw, HANDS)
@@ -247,7 +247,7 @@ def test_a_mistake_in_clips_is_caught(mistake: str, example: type, kitchen_root:
         (H2OAdapter, "h2o", quaternions_from(WXYZ_AS_XYZW, SIDES), "if quaternions of hands too are wxyz, not xyzw"),
     ],
 )
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_wrong_convention_shows_on_the_embedded_corpora(base, name, change, words, small_corpus) -> None:
     problems = not_passed(check(changed(base, change), small_corpus(name).raw, sequences=8))
     assert words in str(problems)

@@ -48,7 +48,7 @@ def test_every_sequence_becomes_a_clip_and_the_store_states_its_origin(root, han
     assert store.info["hand_convention"]["translation"] == "transl"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_number_of_workers_and_the_location_of_the_raw_folder_change_no_byte(root, hands, tmp_path):
     (root / "grab" / "s1" / "mug_lift.npz").write_bytes(b"broken")
     convert_dataset(GrabAdapter(), root, hands, tmp_path / "one", jobs=1, progress=False)

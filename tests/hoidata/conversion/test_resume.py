@@ -26,7 +26,7 @@ from hoidata.store.store import open_store
 from pipelines.lineage.manifests import scan_files
 from tests.hoidata.conversion import killable
 
-pytestmark = pytest.mark.first
+pytestmark = [pytest.mark.first, pytest.mark.long]
 DRIVER = Path(__file__).with_name("killable.py")
 N_SEQUENCES = 24
 KILLS = int(os.environ.get("HOIDATA_KILLS", 3))
@@ -110,14 +110,12 @@ def conversions(tmp_path_factory):
     server.close()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("at", "when"), IN_A_WRITE)
 def test_a_kill_inside_a_write_or_rename_leaves_no_partial_file(conversions, tmp_path, at, when):
     kill = {"at": at, "n": conversions.moment(tmp_path / "counted" / "clips", at, when), "who": "group"}
     assert conversions.kill_and_run_again(tmp_path / "out" / "clips", kill=kill).status == -signal.SIGKILL
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("at", "when"), AT_THE_END)
 def test_a_kill_while_an_old_store_is_replaced_leaves_the_old_or_the_new_one_complete(conversions, tmp_path, at, when):
     out = tmp_path / "out" / "clips"
@@ -134,7 +132,6 @@ def test_a_kill_while_an_old_store_is_replaced_leaves_the_old_or_the_new_one_com
     assert os.listdir(out.parent) == ["clips"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", range(KILLS))
 def test_kills_at_random_moments_change_no_byte(conversions, tmp_path, number):
     after_s = random.Random(number).uniform(0, 0.7)
@@ -145,7 +142,6 @@ def test_kills_at_random_moments_change_no_byte(conversions, tmp_path, number):
     assert killed.status in (-signal.SIGKILL, 0)
 
 
-@pytest.mark.slow
 def test_a_worker_killed_once_changes_no_byte(conversions, tmp_path):
     done = conversions.run(tmp_path / "clips", jobs=2, kill={"at": "rename", "n": 10, "who": "self", "only": "worker"})
     assert (done.status, done.stderr) == (0, "")
@@ -153,7 +149,6 @@ def test_a_worker_killed_once_changes_no_byte(conversions, tmp_path):
     assert len(done.loaded) > N_SEQUENCES
 
 
-@pytest.mark.long
 def test_a_sequence_that_kills_its_worker_twice_is_quarantined_and_not_tried_again_on_resume(conversions, tmp_path):
     out, deadly = tmp_path / "clips", "s1/mug_lift_002"
     late = {"at": "rename", "n": -1, "who": "group", "only": "parent"}
@@ -171,13 +166,11 @@ def test_a_sequence_that_kills_its_worker_twice_is_quarantined_and_not_tried_aga
     assert digests(tmp_path / "again" / "clips") == expected
 
 
-@pytest.mark.slow
 def test_when_the_parent_alone_is_killed_its_workers_end_and_the_next_run_waits_for_them(conversions, tmp_path):
     out = tmp_path / "clips"
     conversions.kill_and_run_again(out, jobs=2, after_s=0.1, signal=signal.SIGKILL, who="parent")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_ctrl_c_ends_the_run_immediately_and_the_next_run_resumes(conversions, tmp_path, jobs):
     stopped = conversions.kill_and_run_again(tmp_path / "clips", jobs, after_s=0.1, signal=signal.SIGINT, who="group")

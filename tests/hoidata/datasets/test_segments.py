@@ -163,6 +163,7 @@ ADAPTERS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ADAPTERS)
 def test_adapters_of_long_recordings_cut_them_into_segments(name, tmp_path, monkeypatch):
     """The recordings of these trees are short, so segments are made shorter. Hands touch from 30 cm."""

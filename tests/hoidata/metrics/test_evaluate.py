@@ -204,7 +204,7 @@ def test_clips_of_one_source_sequence_are_resampled_together():
     assert intervals_of(metric("jitter_m_s3"), together[:2]) == {}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_results_do_not_depend_on_the_number_of_processes(write_annotated, moved, tmp_path, monkeypatch):
     monkeypatch.setattr("hoidata.metrics.evaluate.WORKERS_PAY_FROM", 0)
     root, clips = write_annotated()

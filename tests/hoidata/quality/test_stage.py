@@ -130,7 +130,7 @@ def test_same_clips_give_the_same_bytes(clips_folder, tmp_path):
     assert all((tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes() for name in files)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_worker_processes_change_no_byte(clips_folder, tmp_path, monkeypatch):
     quality_store(clips_folder, tmp_path / "one", jobs=1, progress=False)
     monkeypatch.setattr(stage, "FRAMES_PER_JOB", 1)

@@ -71,7 +71,7 @@ def test_vertices_of_both_parts_move_with_the_object() -> None:
         np.testing.assert_allclose(answer, posed[number][distance.argmin()], atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_hands_leave_the_object_and_are_smoothed_and_the_same_input_gives_the_same_bytes() -> None:
     generated = touching()
     fitted = fit_hands(PAIR, None, IDS, generated)

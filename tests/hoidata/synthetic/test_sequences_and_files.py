@@ -233,6 +233,7 @@ def test_a_corpus_is_the_same_bytes_for_any_number_of_jobs(small_corpus, tmp_pat
     assert _digests(tmp_path / "together") == _digests(small_corpus("grab").raw)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dataset", ONE_ACTION)
 def test_a_corpus_is_sound_and_shifted_hands_are_not(dataset, small_corpus):
     truths = small_corpus(dataset).truths

@@ -20,6 +20,8 @@ from hoidata.synthetic.study_plan import HANDOVER, STUDY_OBJECTS, VERBS, choices
 from tests.builders.objects import igl_signed_m
 from tests.builders.study import check_soundness
 
+pytestmark = pytest.mark.long
+
 DATASETS = tuple(STUDY_OBJECTS)
 TEST, VALIDATION = {"s10"}, {"s9", "s05"}
 REGIONS = [
@@ -135,13 +137,11 @@ def _digests(root) -> dict[str, str]:
     return {str(path.relative_to(root)): sha256_file(path) for path in sorted(root.rglob("*")) if path.is_file()}
 
 
-@pytest.mark.long
 def test_a_study_corpus_is_the_same_bytes_for_any_number_of_jobs(corpora, tmp_path):
     write_corpus("arctic", tmp_path / "together", 1, "study-small", jobs=2)
     assert _digests(corpora["arctic"][0]) == _digests(tmp_path / "together")
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("dataset", DATASETS)
 def test_a_study_corpus_is_sound_and_shifted_hands_are_not(dataset, corpora):
     truths = corpora[dataset][1]
@@ -150,7 +150,6 @@ def test_a_study_corpus_is_sound_and_shifted_hands_are_not(dataset, corpora):
     check_soundness(truths)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("dataset", DATASETS)
 def test_clips_begin_before_contact_and_end_after_it_with_fingers_that_close(dataset, corpora):
     pair = load_embedded_hands()
@@ -174,7 +173,6 @@ def test_a_handover_goes_from_one_region_to_another_and_the_object_stands_the_sa
         assert all(giving.name != taking.name for giving, taking in ways)
 
 
-@pytest.mark.slow
 def test_an_idle_hand_may_be_near_but_never_so_near_that_it_counts(corpora):
     pair = load_embedded_hands()
     for _, sequences in corpora.values():

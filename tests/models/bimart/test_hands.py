@@ -139,6 +139,7 @@ def test_too_short_a_motion_is_bad_input(sampler, path):
         hands_for(sampler, path.track.take(slice(0, 5)))
 
 
+@pytest.mark.long
 def test_files_and_page_are_repeatable_and_each_array_is_documented(motions, path, tmp_path):
     def written(folder: str) -> list[Path]:
         digests = {"checkpoints/bimart-motion/model.safetensors": "ab" * 32}

@@ -325,7 +325,7 @@ def test_page_names_are_safe_file_names():
     assert "/" not in page_name("../../etc/passwd")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_curves_and_contact_follow_the_player_in_chromium(chromium, dataset, page, hands, tmp_path):
     page = page("test/s1/lid")
     profile = f"--user-data-dir={tmp_path / 'profile'}"

@@ -146,7 +146,7 @@ def damaged(values: Any, depth: int = 3, most: int = 24) -> Iterator[Any]:
             yield {(f"{key}x" if key == name else key): item for key, item in values.items()}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("file", READERS)
 def test_all_readers_of_a_damaged_file_name_the_entry(here, file):
     path, messages, damages = here / file, [], set()

@@ -163,7 +163,7 @@ def test_still_shows_the_frame_in_which_most_points_are_touched(project, hands):
     assert still.view == view_of(annotated.clip(clip_id).take(slice(busiest, busiest + 1)), hands)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_report_links_the_page_of_each_dataset_that_has_what_it_needs(project, hands, tmp_path):
     folders, families = ReportFolders.of("embedded", tmp_path), dict.fromkeys(("h2o", "grab"), ("ground-truth",))
     page = write_report(tmp_path / "report", "embedded", families, hands, folders)

@@ -145,7 +145,7 @@ def test_every_array_is_explained_on_the_page(motion, write):
         assert all(f"<dt>{name}</dt>" in page for name in archive.files)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_picture_in_chromium_changes_with_time(chromium, motion, write, tmp_path):
     page = write(motion)[-1]
     pictures = [take_picture(chromium, page, tmp_path / f"{part}.png", part) for part in (0.0, 1.0)]

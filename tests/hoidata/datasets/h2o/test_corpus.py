@@ -20,6 +20,7 @@ def test_gravity_is_straight_down_if_it_is_known_and_has_a_note_on_the_evidence(
         assert clip.gravity is not None or clip.gravity_note.startswith("unknown: ")
 
 
+@pytest.mark.long
 def test_hands_fitted_to_the_joints_are_those_of_the_parameters(small_corpus, load_all, hands):
     fitted, from_parameters = (
         load_all(H2OAdapter(hands="keypoints"), small_corpus("h2o").raw),

@@ -265,7 +265,7 @@ def test_clips_of_hot3d_clips_keep_every_rule_of_the_conformance_check(packed_ro
     assert [item for item in findings if item.outcome == "fail"] == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_clip_of_hot3d_clips_without_manos_numbers_gets_fitted_hands(tmp_path: Path) -> None:
     hot3d.write_clip(tmp_path, "Quest3", 1849, QUEST, hot3d.truth("Quest3", "mano", 1), without="mano")
     assert all(item.hands_from == "keypoints" for item in load_packed(tmp_path) if isinstance(item, Clip))

@@ -46,7 +46,7 @@ def billion_frames(data: bytes) -> bytes:
     return before + b"Frames: 1000000000\n" + after.partition(b"\n")[2]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 class TestManipNet(AdapterContract):
     name = "manipnet"
     corrupted_sequence = "manipnet/tetra_large7"

@@ -78,7 +78,7 @@ def test_source_from_world_recovers_the_numbers_of_the_file(carried: tuple[RawTr
     np.testing.assert_allclose(corner * 10 * MIRROR, [-0.9 + sway - 0.5, 4.0, -0.4], atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_frozen_and_jumping_intervals_are_cut_and_listed(tmp_path: Path) -> None:
     left, right, object_rows = lift_rows(1200)
     for rows in (left, right, object_rows):
@@ -141,7 +141,7 @@ def test_file_names_become_words(name: str, words: str) -> None:
     assert object_words(name) == words
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_margin_keeps_usable_frames_around_the_interaction_under_the_same_id_and_verb(tmp_path: Path) -> None:
     """The hand comes down on the object until frame 100, which is lifted from frame 150; frames 8 to 11 are a jump."""
     left, right, object_rows = lift_rows()
