@@ -15,6 +15,9 @@ from matplotlib.figure import Figure
 
 COLOURS = ("#3b6ea5", "#b5371f", "#5b8c5a", "#8a5a00", "#7a5195", "#6a6f76")
 LOG_RATIO = 20.0
+# Inches around and between the plots of a figure.
+LEFT, TOP = 0.55, 0.28
+_RIGHT, _BOTTOM, _COLUMN_GAP, _ROW_GAP = 0.12, 0.42, 0.5, 0.42
 _STYLE = {
     "svg.fonttype": "none",
     "font.family": "DejaVu Sans",
@@ -69,17 +72,39 @@ def panels_svg(panels: list[Panel], salt: str) -> str:
     return figure_svg((2.9 * len(panels), 2.4), salt, draw)
 
 
-def figure_svg(inches: tuple[float, float], salt: str, draw: Callable[[Figure], None]) -> str:
-    """Call ``draw`` on an empty Matplotlib canvas in the style of the pages and return one ``<svg>`` element."""
+def figure_svg(
+    inches: tuple[float, float], salt: str, draw: Callable[[Figure], None], left: float = LEFT, top: float = TOP
+) -> str:
+    """Call ``draw`` on an empty Matplotlib canvas in the style of the pages and return one ``<svg>`` element.
+
+    left, top: space in inches for the labels on these sides of the plots.
+    """
     style: dict[Any, Any] = {**_STYLE, "svg.hashsalt": salt}
     with matplotlib.rc_context(style):
-        figure = Figure(figsize=inches, layout="constrained")
+        figure = Figure(figsize=inches)
         FigureCanvasSVG(figure)
         draw(figure)
+        _set_margins(figure, *inches, left, top)
         stream = io.StringIO()
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
     svg = re.sub(r"<metadata>.*?</metadata>", "", stream.getvalue(), flags=re.DOTALL)
     return re.sub(r' xmlns(:xlink)?="[^"]*"', "", svg[svg.index("<svg") :])
+
+
+def _set_margins(figure: Figure, width: float, height: float, left: float, top: float) -> None:
+    """Space for titles and tick labels in inches; a layout engine would draw every figure twice."""
+    grid = figure.axes[0].get_gridspec()
+    assert grid is not None
+    plot_width = (width - left - _RIGHT - _COLUMN_GAP * (grid.ncols - 1)) / grid.ncols
+    plot_height = (height - top - _BOTTOM - _ROW_GAP * (grid.nrows - 1)) / grid.nrows
+    figure.subplots_adjust(
+        left=left / width,
+        right=1 - _RIGHT / width,
+        top=1 - top / height,
+        bottom=_BOTTOM / height,
+        wspace=_COLUMN_GAP / plot_width,
+        hspace=_ROW_GAP / plot_height,
+    )
 
 
 def log_curves(path: str | Path) -> list[Curve]:

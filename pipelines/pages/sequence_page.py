@@ -84,7 +84,8 @@ def _timeline(annotated: AnnotatedStore, clips: list[_SequenceClip]) -> str:
         near.set_xlabel("frame of the recording")
         near.set_xlim(0, last + 1)
 
-    return figure_svg((max(_MIN_INCHES, _INCHES_PER_FRAME * last), _HEIGHT_INCHES), clips[0].clip.sequence, draw)
+    inches = max(_MIN_INCHES, _INCHES_PER_FRAME * last), _HEIGHT_INCHES
+    return figure_svg(inches, clips[0].clip.sequence, draw, left=0.9, top=0.9)
 
 
 def _height_cm(clip: Clip, first: Clip) -> np.ndarray:
