@@ -111,8 +111,8 @@ def _residuals(
     motion = body_motion(track.model, rotvec_to_rotmat(track.rotvec), track.translation_m, track.hinge_rad)
     wrench = required_wrench(motion, FPS, GRAVITY)
     poses, patches = track.world_from_object, {side: hand_patches(pair[side]) for side in near}
-    for row, frame in enumerate(frames):
-        contacts = [patch_contacts(one, patches[side], row) for side, one in near.items()]
+    for index, frame in enumerate(frames):
+        contacts = [patch_contacts(one, patches[side], index) for side, one in near.items()]
         points = poses[frame] @ np.concatenate([contact.points_m for contact in contacts])
         normals = poses[frame].turn(np.concatenate([contact.normals for contact in contacts]))
         yield force_residual(points, normals, motion.centre_m[frame], wrench[frame])

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 COLOURS = ("#3b6ea5", "#b5371f", "#5b8c5a", "#8a5a00", "#7a5195", "#6a6f76")
 LOG_RATIO = 20.0
-# Inches around and between the plots of a figure.
+# Inches around and between the plots of a drawing.
 LEFT, TOP = 0.55, 0.28
 _RIGHT, _BOTTOM, _COLUMN_GAP, _ROW_GAP = 0.12, 0.42, 0.5, 0.42
 _STYLE = {
@@ -92,7 +92,7 @@ def figure_svg(
 
 
 def _set_margins(figure: Figure, width: float, height: float, left: float, top: float) -> None:
-    """Space for titles and tick labels in inches; a layout engine would draw every figure twice."""
+    """Space for titles and tick labels in inches; a layout engine would draw everything twice."""
     grid = figure.axes[0].get_gridspec()
     assert grid is not None
     plot_width = (width - left - _RIGHT - _COLUMN_GAP * (grid.ncols - 1)) / grid.ncols
