@@ -1,9 +1,10 @@
 """Prepares an object's mesh for display: crease normals, and subdivision fine enough to show a contact map."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
+from cachetools import LRUCache, cached
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
@@ -39,13 +40,18 @@ def display_surface(vertices_m: np.ndarray, faces: np.ndarray, paint: ContactPai
 
     ``paint`` must have the points of this part only; without points the value is zero everywhere.
     """
-    corner_normals = crease_normals(vertices_m, faces)
-    if paint is None:
-        return _merge(vertices_m[faces], corner_normals)
-    edge_m = max(PAINT_EDGE_M, float(np.ptp(vertices_m, axis=0).max()) * PAINT_EDGE_PER_EXTENT)
-    corners, normals = _subdivide(vertices_m[faces], corner_normals, edge_m)
-    surface = _merge(corners, normals)
-    return Surface(surface.vertices_m, surface.normals, surface.faces, paint_values(surface.vertices_m, paint))
+    surface = _triangles(vertices_m, faces, paint is not None)
+    return surface if paint is None else replace(surface, value=paint_values(surface.vertices_m, paint))
+
+
+# A page shows one object several times.
+@cached(LRUCache(16), key=lambda vertices_m, faces, is_fine: (vertices_m.tobytes(), faces.tobytes(), is_fine))
+def _triangles(vertices_m: np.ndarray, faces: np.ndarray, is_fine: bool) -> Surface:
+    corners, normals = vertices_m[faces], crease_normals(vertices_m, faces)
+    if is_fine:
+        edge_m = max(PAINT_EDGE_M, float(np.ptp(vertices_m, axis=0).max()) * PAINT_EDGE_PER_EXTENT)
+        corners, normals = _subdivide(corners, normals, edge_m)
+    return _merge(corners, normals)
 
 
 def crease_normals(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
