@@ -4,11 +4,20 @@ import trimesh
 
 from hoidata.datasets.grab.adapter import OBJECTS as GRAB_WORDS
 from hoidata.datasets.h2o.adapter import ACTIONS
+from hoidata.hands import load_embedded_hands
 from hoidata.objects.mesh import mass_properties
 from hoidata.objects.surface_index import PartSurface, surface_index
 from hoidata.splits.definitions import published
 from hoidata.synthetic.catalogue import OBJECTS, object_model, object_spec
-from hoidata.synthetic.hand_capsules import gradient, grid_field, seen_by
+from hoidata.synthetic.hand_capsules import (
+    OPEN_RAD,
+    capsule_hands,
+    close_fingers,
+    gradient,
+    grid_field,
+    sample_placements,
+    seen_by,
+)
 from hoidata.synthetic.shapes import cylinder, revolved, rounded_box, sharp_box, sphere, torus, united
 from tests.builders.objects import igl_signed_m
 
@@ -148,3 +157,22 @@ def test_triangles_of_a_union_stand_in_one_order_only():
     assert (union.faces.argmin(axis=1) == 0).all()
     assert union.faces.tolist() == sorted(union.faces.tolist())
     assert mass_properties(union.vertices_m, union.faces).volume_m3 > 0.1 * 0.08 * 0.06 * 0.9
+
+
+def test_hands_that_close_together_close_as_each_alone():
+    """Fingers stop at different moments; a hand that still closes must not depend on one that has finished."""
+    random = np.random.default_rng(0)
+
+    def ball(points_m: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(points_m, axis=-1) - 0.035
+
+    placement = sample_placements(ball, np.tile([0.0, 0.0, 1.0], (6, 1)), np.zeros((6, 3)), (0.0, 1.0), random)
+    hands = capsule_hands(load_embedded_hands().right, np.zeros((1, 10))).take(placement.hand)
+    wrist_m, flexion_rad = close_fingers(ball, hands, placement)
+    assert len({round(float(total), 3) for total in flexion_rad.sum((1, 2))}) == 6
+    assert (flexion_rad.sum((1, 2)) > OPEN_RAD.sum() + 1).all()
+    for number in range(6):
+        row = np.array([number])
+        alone = close_fingers(ball, hands.take(row), placement.take(row))
+        np.testing.assert_allclose(alone[0][0], wrist_m[number], atol=1e-12)
+        np.testing.assert_allclose(alone[1][0], flexion_rad[number], atol=1e-9)

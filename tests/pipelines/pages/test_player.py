@@ -20,7 +20,7 @@ from hoidata.objects.model import ObjectModel
 from pipelines.pages import player
 from pipelines.pages.glb import contact_colours, continuous_quaternions, glb_bytes, upright_rotation
 from pipelines.pages.player import motion_player, three_javascript, view_of
-from pipelines.pages.surface import ContactPaint, crease_normals, paint_values
+from pipelines.pages.surface import ContactPaint, crease_normals, display_surface, paint_values
 
 
 def without_pose_correctives(model: HandModel) -> HandModel:
@@ -110,6 +110,19 @@ def test_full_contact_is_painted_full_everywhere_and_no_points_paint_nothing():
     everywhere = ContactPaint(points, np.zeros(3), np.ones(3))
     assert np.allclose(paint_values(np.array([[-50.0, 0, 0], [1.0, 0, 0]]), everywhere), 1)
     assert (paint_values(points, ContactPaint(np.zeros((0, 3)), np.zeros(0), np.zeros(0))) == 0).all()
+
+
+def test_the_same_mesh_is_shown_plain_and_with_each_of_its_contact_maps():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    vertices, faces = np.asarray(box.vertices), np.asarray(box.faces)
+    paints = [ContactPaint(vertices, np.zeros(8), np.full(8, value)) for value in (0.25, 0.75)]
+    first, second = (display_surface(vertices, faces, paint) for paint in paints)
+    plain, larger = display_surface(vertices, faces), display_surface(2 * vertices, faces)
+    assert np.allclose(first.value, 0.25)
+    assert np.allclose(second.value, 0.75)
+    assert plain.value is None
+    assert len(plain.vertices_m) == 24 < len(first.vertices_m)
+    assert np.allclose(larger.vertices_m, 2 * plain.vertices_m)
 
 
 def test_edges_of_a_box_stay_crisp_and_a_ball_is_smooth():
