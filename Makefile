@@ -45,7 +45,7 @@ test: install-dev
 test-fast: install-dev
 	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope -m "not slow and not long"
 
-# Whole runs, trainings and corpora, killed processes and servers, each of 5 seconds or more; CI runs them after `make check`.
+# Whole runs, trainings and corpora, killed processes and servers, most of 5 seconds or more; CI runs them after `make check`.
 test-long: install-dev
 	OMP_NUM_THREADS=1 pytest -n 3 --dist loadscope -m long
 

@@ -28,9 +28,6 @@ class SignedDistance(NamedTuple):
     closest_m: np.ndarray  # (point, 3) on the surface
     normal: np.ndarray  # (point, 3) unit gradient of the signed distance, outward
 
-    def take(self, rows: np.ndarray) -> "SignedDistance":
-        return SignedDistance(*(array[rows] for array in self))
-
 
 class MergedSurface(NamedTuple):
     """A mesh whose coinciding vertices are merged, without triangles that collapse."""

@@ -1,7 +1,5 @@
 """Checks that a synthetic action is physically plausible, with the meshes of hands and object."""
 
-from collections.abc import Iterator
-
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -26,7 +24,6 @@ LARGEST_PENETRATION_M = 0.009
 LARGEST_DISTANCE_M = 0.02
 _JOINT_TOUCH_M = 0.014
 _IDLE_M = 0.2
-_FIRST_LOOK_FRAMES = 8  # every eighth frame is looked at first
 # In clips with ``contact_by_side``, an idle hand may be close, but its joints keep out of the 2 cm within which a hand
 # is active. Joints of active hands stay above the table, and joints of the two hands stay apart.
 _NEAR_IDLE_M, _TABLE_M, _HANDS_APART_M = 0.028, 0.0, 0.012
@@ -39,10 +36,6 @@ def is_sound(truth: TruthSequence, pair: HandPair) -> bool:
     object is lifted.
     """
     truth = truth.at_30_fps()
-    # Most implausible motions already fail in these few frames.
-    few = np.flatnonzero(truth.lifted)[::_FIRST_LOOK_FRAMES]
-    if len(few) and not _forces_explain(truth, few, surface_distances(truth.take(few), pair), pair):
-        return False
     grasping = {side: truth.in_contact(side) if truth.contact_by_side else truth.lifted for side in truth.active_sides}
     near = surface_distances(truth, pair)
     for side, distances in near.items():
@@ -56,12 +49,7 @@ def is_sound(truth: TruthSequence, pair: HandPair) -> bool:
         is_clear = _near_idle(truth, pair) > _NEAR_IDLE_M and _is_clear(truth, pair)
     else:
         is_clear = _idle(truth, pair) > _IDLE_M
-    lifted = np.flatnonzero(truth.lifted)
-    return is_clear and _forces_explain(truth, lifted, {side: one.take(lifted) for side, one in near.items()}, pair)
-
-
-def _forces_explain(truth: TruthSequence, frames: np.ndarray, near: dict[Side, SignedDistance], pair: HandPair) -> bool:
-    return all(residual < RESIDUAL_LIMIT for residual in _residuals(truth, frames, near, pair))
+    return is_clear and bool((force_residuals(truth, near, pair) < RESIDUAL_LIMIT).all())
 
 
 def surface_distances(truth: TruthSequence, pair: HandPair) -> dict[Side, SignedDistance]:
@@ -99,23 +87,17 @@ def _is_clear(truth: TruthSequence, pair: HandPair) -> bool:
 
 def force_residuals(truth: TruthSequence, near: dict[Side, SignedDistance], pair: HandPair) -> np.ndarray:
     """Return (lifted frame,) the part of the object's wrench that no contact forces explain, N and N m, at 30 fps."""
-    lifted = np.flatnonzero(truth.lifted)
-    return np.array(list(_residuals(truth, lifted, {side: one.take(lifted) for side, one in near.items()}, pair)))
-
-
-def _residuals(
-    truth: TruthSequence, frames: np.ndarray, near: dict[Side, SignedDistance], pair: HandPair
-) -> Iterator[float]:
-    """Yield the residual of each of ``frames``; ``near`` has the distances of these frames."""
     track = truth.object
     motion = body_motion(track.model, rotvec_to_rotmat(track.rotvec), track.translation_m, track.hinge_rad)
     wrench = required_wrench(motion, FPS, GRAVITY)
-    poses, patches = track.world_from_object, {side: hand_patches(pair[side]) for side in near}
-    for index, frame in enumerate(frames):
-        contacts = [patch_contacts(one, patches[side], index) for side, one in near.items()]
+    patches, residuals = {side: hand_patches(pair[side]) for side in near}, []
+    poses = track.world_from_object
+    for frame in np.flatnonzero(truth.lifted):
+        contacts = [patch_contacts(one, patches[side], int(frame)) for side, one in near.items()]
         points = poses[frame] @ np.concatenate([contact.points_m for contact in contacts])
         normals = poses[frame].turn(np.concatenate([contact.normals for contact in contacts]))
-        yield force_residual(points, normals, motion.centre_m[frame], wrench[frame])
+        residuals.append(force_residual(points, normals, motion.centre_m[frame], wrench[frame]))
+    return np.array(residuals)
 
 
 def _joint_distance(truth: TruthSequence, side: Side, pair: HandPair, vertices: SignedDistance) -> np.ndarray:

@@ -47,6 +47,7 @@ def display_surface(vertices_m: np.ndarray, faces: np.ndarray, paint: ContactPai
 # A page shows one object several times.
 @cached(LRUCache(16), key=lambda vertices_m, faces, is_fine: (vertices_m.tobytes(), faces.tobytes(), is_fine))
 def _triangles(vertices_m: np.ndarray, faces: np.ndarray, is_fine: bool) -> Surface:
+    """The triangles without a contact map; fine ones have short edges, which show a map."""
     corners, normals = vertices_m[faces], crease_normals(vertices_m, faces)
     if is_fine:
         edge_m = max(PAINT_EDGE_M, float(np.ptp(vertices_m, axis=0).max()) * PAINT_EDGE_PER_EXTENT)

@@ -172,7 +172,7 @@ def test_hands_that_close_together_close_as_each_alone():
     assert len({round(float(total), 3) for total in flexion_rad.sum((1, 2))}) == 6
     assert (flexion_rad.sum((1, 2)) > OPEN_RAD.sum() + 1).all()
     for number in range(6):
-        row = np.array([number])
-        alone = close_fingers(ball, hands.take(row), placement.take(row))
+        one = np.array([number])
+        alone = close_fingers(ball, hands.take(one), placement.take(one))
         np.testing.assert_allclose(alone[0][0], wrist_m[number], atol=1e-12)
         np.testing.assert_allclose(alone[1][0], flexion_rad[number], atol=1e-9)
