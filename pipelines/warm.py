@@ -31,6 +31,8 @@ SOCKET = "HOIDATA_WARM"
 PRELOADED = (
     "numpy", "scipy.spatial.transform", "scipy.optimize", "scipy.stats", "pandas", "pyarrow.parquet", "numba", "orjson",
     "torch", "safetensors.torch", "trimesh", "igl", "rich.progress", "ruamel.yaml", "filelock", "threadpoolctl",
+    # Imported by the first optimiser and by the first compiled function.
+    "torch._dynamo", "numba.core.inline_closurecall", "numba.cpython.charseq",
 )  # fmt: skip
 # Libraries read these on import. Idle OpenMP threads must sleep: spinning ones cost ten times as much on a busy
 # machine. BLAS gets one thread: for small matrices two take five times as long, and change the last bits.

