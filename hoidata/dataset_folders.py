@@ -35,6 +35,7 @@ class DatasetFacts:
     needs_mano: bool  # raw files have MANO parameters
     source_fps: float
     paper: str = ""  # authors, title, venue and year
+    derives_verbs: bool = False  # the adapter derives verbs from the motion; the files have no action labels
     split: str = ""  # name of the default split; "" if the user has to choose one in params.yaml
     conventions: dict[str, str] = field(default_factory=dict)  # by row of CONVENTIONS.md, one line each
     # ``licence`` and ``may_be_shared`` of arrays under another licence, by their name in dataset cards
@@ -103,7 +104,8 @@ def _read_facts(folder: Path) -> DatasetFacts:
     try:
         return DatasetFacts(folder.name, **values)
     except TypeError as error:
-        raise BadInput(path, "every fact but paper, split, conventions and licences", str(error), REMEDY) from error
+        expected = "every fact but paper, derives_verbs, split, conventions and licences"
+        raise BadInput(path, expected, str(error), REMEDY) from error
 
 
 def _listed_in_settings() -> list[str]:

@@ -122,7 +122,7 @@ def _annotate_clips(
         clip = store.clip(clip_id)
         joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
         evidence = find_active_hands(clip, joints, indices[clip.object.model.name], threshold_m)
-        hand, verb = _hand(clip, evidence, settings), _verb(clip, evidence, settings)
+        hand, verb = _hand(clip, evidence, settings), _verb(clip, evidence, settings, store.info)
         sentences, reason = None, excluded.get(clip_id)
         if reason is None:
             sentences, reason = _sentences(verb.base, clip.object_words, hand.active, evidence, settings)
@@ -139,10 +139,10 @@ def _hand(clip: Clip, evidence: HandEvidence, settings: AnnotationSettings) -> _
     return _Hand(labelled, "annotated") if tracked else _Hand(close, "proximity")
 
 
-def _verb(clip: Clip, evidence: HandEvidence, settings: AnnotationSettings) -> _Verb:
-    """Return the verb of the source, else the verb derived from the motion, if enabled and a hand is active."""
+def _verb(clip: Clip, evidence: HandEvidence, settings: AnnotationSettings, info: Mapping[str, Any]) -> _Verb:
+    """Return the clip's verb, else the verb derived from the motion, if enabled and a hand is active."""
     if clip.verb is not None:
-        return _Verb(clip.verb, "source")
+        return _Verb(clip.verb, "derived" if info.get("derives_verbs") else "source")
     if not settings.derive_verbs or evidence.hand_type is None:
         return _Verb(None, None)
     derived = derive_verb(clip, evidence)

@@ -216,4 +216,5 @@ def _store_info(adapter: Adapter, hands: HandPair, synthetic: bool, reason: str 
         where_to_register=adapter.where_to_register,
         empty_reason=reason,
         **({"licences": array_licences} if array_licences else {}),
+        **({"derives_verbs": True} if getattr(adapter, "derives_verbs", False) else {}),
     )

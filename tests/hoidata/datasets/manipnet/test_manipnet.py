@@ -8,9 +8,11 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hoidata.annotation.stage import annotate_store
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets import Quarantined, RawTree
@@ -357,3 +359,10 @@ def test_capsule_radii_are_metres(root, stored):
     capsules = json.loads((root / "hand/hand_reference.json").read_text())["capsules"]
     radius_m = [capsule["radius"] / 10 for capsule in capsules]
     np.testing.assert_allclose(stored.recording(KEY.name).hand.capsules.radius_m, radius_m)
+
+
+def test_verbs_from_the_motion_are_not_called_labels(stored, tmp_path):
+    counts = annotate_store(stored.folder, tmp_path / "annotation", encoder="hash")
+    verbs = pd.read_parquet(tmp_path / "annotation/hand_type.parquet")
+    assert verbs[["verb", "verb_source"]].to_numpy().tolist() == [["lift", "derived"]]
+    assert counts["derived_verbs"] == 1
