@@ -24,6 +24,7 @@ _STYLE = {
     "font.size": 9,
     "axes.spines.top": False,
     "axes.spines.right": False,
+    "axes.titley": 1.0,  # an automatic position takes an eighth of the time: it measures all labels
     "axes.edgecolor": "#b8b8b4",
     "axes.labelcolor": "#6a6f76",
     "xtick.color": "#6a6f76",

@@ -24,6 +24,9 @@ from pipelines.pages import glb
 from pipelines.pages.surface import ContactPaint
 
 _FOLDER = Path(__file__).parent
+_TEMPLATES = Environment(
+    loader=FileSystemLoader(_FOLDER), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+)
 ASIDE_RAD = np.radians(40.0)  # a view past the touched side shows the border of the contact
 _POINTS_FOR_VIEW = 400
 _HAND_MARGIN_M = 0.015
@@ -61,7 +64,7 @@ class Player:
     @property
     def glb_packed(self) -> str:
         """The GLB as embedded in the page: deflated to a third of the bytes, then base64."""
-        return base64.b64encode(zlib.compress(self.glb, 9)).decode("ascii")
+        return base64.b64encode(zlib.compress(self.glb)).decode("ascii")
 
 
 def motion_player(
@@ -102,12 +105,8 @@ def contact_player(
 
 def write_page(path: str | Path, template: str, **values: object) -> Path:
     """Write the HTML of one template of this package; values are escaped, and an undefined name is an error."""
-    loader = FileSystemLoader(_FOLDER)
-    environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
     has_players = bool(values.get("has_players"))
-    page = environment.get_template(template).render(
+    page = _TEMPLATES.get_template(template).render(
         css=Markup((_FOLDER / "page.css").read_text(encoding="utf-8")),
         three_js=Markup(three_javascript()) if has_players else "",
         player_js=Markup((_FOLDER / "player.js").read_text(encoding="utf-8")) if has_players else "",
