@@ -76,9 +76,12 @@ def _leading(measured: dict[str, Facts]) -> dict[str, dict[str, float]]:
 
 
 def _unmeasured(measured: dict[str, Facts]) -> dict[str, dict[str, str]]:
-    """The leading metrics without a value, by family, with reasons and counts in words."""
+    """The leading metrics without a value, by family, with reasons and counts in words; ``empty``: no motions."""
     by_family = {}
     for family, content in measured.items():
+        if "empty" in content:
+            by_family[family] = {"empty": str(content["empty"])}
+            continue
         reasons, values = content.get("unmeasured", {}), content.get("figures", {})
         by_family[family] = {
             name: reasons_in_words(reasons[name]) for name in LEADING if name in reasons and name not in values

@@ -153,9 +153,8 @@ def _upright(track: ObjectTrack, middle_m: np.ndarray, gravity: np.ndarray | Non
     tilt = np.degrees(np.arccos(np.clip((since_first @ up) @ up, -1, 1)))
     steps = rotation_angles_about(rotation, up)
     # Smoothing first: tracking noise would add up in a sum of absolute steps.
-    turn_deg = np.degrees(
-        np.abs(np.convolve(steps, np.full(_SMOOTHING_FRAMES, 1 / _SMOOTHING_FRAMES), mode="full")).sum()
-    )
+    smoothed = np.convolve(steps, np.full(_SMOOTHING_FRAMES, 1 / _SMOOTHING_FRAMES), mode="full") if len(steps) else 0
+    turn_deg = np.degrees(np.abs(smoothed).sum())
     return {
         "rise_m": float(rise.max()),
         "end_rise_m": float(rise[-1]),
@@ -279,37 +278,44 @@ def learn_actions(
         numbers: by verb, ``action_numbers`` of each clip.
         written: by verb, limits that replace computed ones if most of the verb's clips satisfy them.
     """
-    all_clips = [clip for clips in numbers.values() for clip in clips]
     scale = {}
     for name in VERB_MEASURES:
-        column = np.array([clip[name] for clip in all_clips])
-        if len(column) and np.isfinite(column).all():
+        by_verb = [_finite(clips, name) for clips in numbers.values()]
+        if by_verb and all(by_verb):  # no clip of some verb: the measure cannot tell verbs apart
+            column = np.concatenate(by_verb)
             scale[name] = float(column.mean()), max(float(column.std()), MIN_DEVIATION[name.rpartition("_")[2]])
     usual = usual_limits(numbers, scale)
     limits, learnt = dict[str, Limits](), dict[str, int]()
     for verb, clips in numbers.items():
         table = (written or {}).get(verb)
-        if table is not None and np.mean([_within(clip, table) is True for clip in clips]) >= MIN_FRACTION_WITHIN:
+        within = [] if table is None else [one for clip in clips if (one := _within(clip, table)) is not None]
+        if table is not None and within and np.mean(within) >= MIN_FRACTION_WITHIN:
             limits[verb] = table
         elif verb in usual and not _within(AT_REST, usual[verb]):
             limits[verb], learnt[verb] = usual[verb], len(clips)
-    centroids = {verb: np.mean([_standardised(clip, scale) for clip in clips], 0) for verb, clips in numbers.items()}
+    centroids = {verb: np.nanmean([_standardised(clip, scale) for clip in clips], 0) for verb, clips in numbers.items()}
     return Actions(limits=limits, learnt=learnt, centroids=centroids, scale=scale, usual=usual)
 
 
 def usual_limits(
     numbers: Mapping[str, list[dict[str, float]]], scale: Mapping[str, tuple[float, float]]
 ) -> dict[str, Limits]:
-    """Compute the usual range of each measure in ``scale``, by verb with ``MIN_CLIPS`` clips or more.
+    """Compute the usual range of each measure in ``scale``, by verb; only from ``MIN_CLIPS`` known values or more.
 
     The range is the 1st to the 99th percentile, widened by ``MARGIN`` deviations of the verb's clips. If these hardly
     differ, the deviation of all clips is used.
     """
     limits = dict[str, Limits]()
     for verb, clips in numbers.items():
-        if len(clips) >= MIN_CLIPS:
-            limits[verb] = {name: _range([clip[name] for clip in clips], of_all) for name, (_, of_all) in scale.items()}
+        known = {name: _finite(clips, name) for name in scale}
+        ranges = {name: _range(values, scale[name][1]) for name, values in known.items() if len(values) >= MIN_CLIPS}
+        limits |= {verb: ranges} if ranges else {}
     return limits
+
+
+def _finite(clips: list[dict[str, float]], name: str) -> list[float]:
+    """The values of one measure, without those of clips in which it is unknown."""
+    return [clip[name] for clip in clips if np.isfinite(clip[name])]
 
 
 def _range(values: list[float], of_all_clips: float) -> tuple[float, float]:

@@ -112,22 +112,22 @@ def evaluate_store(
     Raises:
         BadInput: no clip of the two stores can be compared.
     """
-    annotated, store = load_annotated(reference, hands), open_store(predicted, hands)
-    recordings = annotated.store
+    whole, store = load_annotated(reference, hands), open_store(predicted, hands)
+    annotated = training = whole
     if protocol := store.info.get("windows"):
-        source = f"{predicted}/meta/info.json: windows"
-        annotated = WindowedStore(annotated, build_config(WindowProtocol, protocol, source), split)
+        windows = build_config(WindowProtocol, protocol, f"{predicted}/meta/info.json: windows")
+        annotated, training = WindowedStore(whole, windows, split), WindowedStore(whole, windows, "train")
     clip_ids = annotated.ids(split)
     samples, skipped = match_predictions(store.ids, clip_ids)
     evaluator = _Evaluator(
         annotated=annotated,
-        recordings=recordings,
+        recordings=whole.store,
         store=store,
         metrics=metrics,
         samples=samples,
         target_contact=read_target_contact(predicted),
         target_distances=read_target_distances(predicted),
-        actions=training_actions(annotated),
+        actions=training_actions(training),
     )
     results = _measured(evaluator, clip_ids, jobs, progress)
     skipped += [item for clip_id in clip_ids for item in results[clip_id].skipped]
@@ -240,9 +240,10 @@ class _Reference:
         whole = self.motion
         joints: dict[Side, np.ndarray] = {side: whole.joints_m[side][start:stop] for side in SIDES}
         touched = np.zeros(self.index.count, dtype=bool)
-        near = self.entries.window(start, stop)
-        touched[near.point[np.isin(near.side, [SIDES.index(side) for side in self.sides])]] = True
-        motion = Motion(whole.clip.take(slice(start, stop)), joints, whole.hands)
+        near, clip = self.entries.window(start, stop), whole.clip.take(slice(start, stop))
+        measured = np.stack([clip.hands[side].valid & clip.recorded & (side in self.sides) for side in SIDES])
+        touched[near.point[measured[near.side, near.frame]]] = True
+        motion = Motion(clip, joints, whole.hands)
         return motion, TrueContact(self.index, self.part, touched, self.threshold_m)
 
 
@@ -391,14 +392,12 @@ def window_of(predicted: Clip, reference: Clip, sides: tuple[Side, ...]) -> tupl
 def _start_in(part: np.ndarray, whole: np.ndarray) -> int:
     """The index at which ``whole (m,)`` contains ``part (n,)`` contiguously; -1 if it does not.
 
-    A part numbered from 0 on, in a recording without these numbers, starts at 0.
+    A part numbered from 0 on that a longer recording does not contain starts at 0.
     """
-    if len(part) < len(whole) and np.array_equal(part, np.arange(len(part))) and part[-1] not in whole:
-        return 0
     for start in np.flatnonzero(whole == part[0]):
         if np.array_equal(whole[start : start + len(part)], part):
             return int(start)
-    return -1
+    return 0 if len(part) < len(whole) and np.array_equal(part, np.arange(len(part))) else -1
 
 
 def _is_same_mesh(one: ObjectModel, other: ObjectModel) -> bool:

@@ -133,14 +133,14 @@ def feature_distances(encoded: EncodedSet) -> np.ndarray:
 
 
 def mean_matrix(comparison: Comparison, matrix_of: Callable[[EncodedSet], np.ndarray]) -> np.ndarray:
-    """(clip, clip) mean over the repetitions of each one's (motion, motion) matrix."""
+    """(clip, clip) mean over the repetitions of each one's (motion, motion) matrix; NaN for clips that share none."""
     total = np.zeros((len(comparison.clips),) * 2)
     count = np.zeros_like(total)
     for run in comparison.repetitions:
         rows = np.searchsorted(comparison.clips, run.clip)
         total[np.ix_(rows, rows)] += matrix_of(run)
         count[np.ix_(rows, rows)] += 1
-    return total / np.maximum(count, 1)
+    return np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
 
 
 ROWS_PER_FEATURE = 4
@@ -209,16 +209,20 @@ def mean_of_pairs(matrix: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """(resample,) mean over all pairs of different rows of a symmetric (row, row) matrix; NaN with fewer than two.
 
     Args:
+        matrix: NaN in pairs that do not count.
         weights: (resample, row) how often each row counts; a row never pairs with itself.
     """
-    off = matrix - np.diag(np.diag(matrix))
-    pairs = np.square(weights.sum(axis=1)) - np.square(weights).sum(axis=1)
-    return np.divide(_total(off, weights), pairs, out=np.full(len(weights), np.nan), where=pairs > 0)
+    off = matrix.copy()
+    np.fill_diagonal(off, np.nan)
+    return mean_with_itself(off, weights)
 
 
 def mean_with_itself(matrix: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(resample,) mean over all pairs of rows of a (row, row) matrix, including a row with itself."""
-    return _total(matrix, weights) / np.square(weights.sum(axis=1))
+    """(resample,) mean over all pairs of rows of a (row, row) matrix, including a row with itself; without NaN."""
+    is_known = np.isfinite(matrix)
+    pairs = _total(is_known.astype(np.float64), weights)
+    total = _total(np.where(is_known, matrix, 0), weights)
+    return np.divide(total, pairs, out=np.full(len(weights), np.nan), where=pairs > 0)
 
 
 def _total(matrix: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -119,28 +119,28 @@ def realism_as_released(pair: Pair, frame_step: int) -> Values:
 
 def floor_si(pair: Pair, frame_step: int) -> Values:
     """(lifted frame,) as ``realism_si`` without hands: 1 only in free fall. Lower bound of the metric."""
-    return _passed(_scored(_without_hands(pair), "SI", frame_step))
+    return _passed(_scored(_without_hands(pair), pair, "SI", frame_step))
 
 
 def floor_as_released(pair: Pair, frame_step: int) -> Values:
     """(lifted frame,) as ``realism_as_released`` without hands."""
-    return _passed(_scored(_without_hands(pair), "as released", frame_step))
+    return _passed(_scored(_without_hands(pair), pair, "as released", frame_step))
 
 
 def realism_every_frame(pair: Pair, frame_step: int) -> Values:
     """(frame,) 1 where contact forces of hands and table explain the object's motion and no hand is deep inside it."""
-    return _every_frame(pair.scene, frame_step)
+    return _every_frame(pair.scene, pair, frame_step)
 
 
 def floor_every_frame(pair: Pair, frame_step: int) -> Values:
     """(frame,) as ``realism_every_frame`` without hands: 1 where the object rests on the table or falls."""
-    return _every_frame(_without_hands(pair), frame_step)
+    return _every_frame(_without_hands(pair), pair, frame_step)
 
 
-def _every_frame(scene: Scene | Unmeasured, frame_step: int) -> Values:
+def _every_frame(scene: Scene | Unmeasured, pair: Pair, frame_step: int) -> Values:
     if isinstance(scene, Unmeasured):
         return scene
-    return every_frame_passes(scene, _every_nth(np.ones(scene.n_frames, bool), frame_step)).astype(np.float64)
+    return every_frame_passes(scene, _every_nth(pair.measured, frame_step)).astype(np.float64)
 
 
 def capsule_depth_mm(pair: Pair, frame_step: int) -> Values:
@@ -167,13 +167,13 @@ def _without_hands(pair: Pair) -> Scene | Unmeasured:
 
 @lru_cache(maxsize=2)
 def _realism(pair: Pair, variant: str, frame_step: int) -> Realism | Unmeasured:
-    return _scored(pair.scene, variant, frame_step)
+    return _scored(pair.scene, pair, variant, frame_step)
 
 
-def _scored(scene: Scene | Unmeasured, variant: str, frame_step: int) -> Realism | Unmeasured:
+def _scored(scene: Scene | Unmeasured, pair: Pair, variant: str, frame_step: int) -> Realism | Unmeasured:
     if isinstance(scene, Unmeasured):
         return scene
-    return score(scene, VARIANTS[variant], _every_nth(scene.lifted, frame_step))
+    return score(scene, VARIANTS[variant], _every_nth(scene.lifted & pair.measured, frame_step))
 
 
 def _every_nth(frames: np.ndarray, frame_step: int) -> np.ndarray:

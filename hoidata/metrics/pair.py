@@ -69,6 +69,11 @@ class Pair:
         """(frame,) bool: the frames of the prediction in which this hand is measured; never an interpolated one."""
         return self._timed.hands[side].valid & self._timed.recorded
 
+    @property
+    def measured(self) -> np.ndarray:
+        """(frame,) bool: the frames of the prediction in which all acting hands are measured."""
+        return np.all([self.valid(side) for side in self.sides], axis=0)
+
     def frames(self, side: Side, frame_step: int = 1) -> np.ndarray:
         """Indices of every n-th frame in which this hand is measured."""
         return np.flatnonzero(self.valid(side))[::frame_step]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
@@ -24,7 +25,7 @@ PRESSED_M = 0.01
 PRESSED_DEEP_M = SHIFTED_M = 0.03
 # Standard deviation of the wrist along each axis and of every angle: together 5 mm at a joint.
 NOISE_WRIST_M, NOISE_RAD = 0.0018, 0.025
-MOST_FRAMES_MEASURED = 8
+FIRST_FRAMES_MEASURED, ROUNDING_M = 8, 1e-9
 NEVER_TOUCHES = "its hands never touch the object in the frames asked for"
 DIRECTIONS = np.array(
     [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], np.float64
@@ -98,7 +99,7 @@ def object_moved(clip: Clip, recording: Recording) -> Clip:
 
 
 def hands_away(clip: Clip, recording: Recording) -> Clip | str:
-    """Keep each hand 2 cm off the surface: one shift in the object frame that clears all frames with contact."""
+    """Keep each hand 2 cm off the surface: one shift in the object frame, for all frames."""
     return _with_hands(clip, {side: _moved_off(clip, recording, side) for side in recording.sides})
 
 
@@ -174,16 +175,22 @@ def _with_hands(clip: Clip, tracks: dict[Side, HandTrack | None]) -> Clip | str:
 
 
 def _moved_off(clip: Clip, recording: Recording, side: Side) -> HandTrack | None:
-    touching = recording.touching_frames(side)
-    if not len(touching):
+    """The hand moved by one shift in the object's frame, after which it is ``HANDS_AWAY_M`` away in all frames."""
+    if not len(recording.touching_frames(side)):
         return None
-    frames = touching[np.linspace(0, len(touching) - 1, min(MOST_FRAMES_MEASURED, len(touching))).astype(int)]
-    points, track = recording.request.points, clip.object.take(frames)
+    valid = np.flatnonzero(clip.hands[side].valid)
+    points, track = recording.request.points, clip.object.take(valid)
     points_m = articulate(points.points_m.astype(np.float64), points.part, track.model.hinge, track.hinge_rad)
-    joints_m = track.world_from_object.inverse() @ recording.annotated.joints(recording.request.clip_id, side)[frames]
-    joints_from_points = joints_m[:, :, None] - points_m[:, None]
-    shift = _shortest_clearing_move(joints_from_points.reshape(-1, 3), HANDS_AWAY_M)
-    return _shifted(clip.hands[side], clip.object.world_from_object.rotation @ shift)
+    points_m = np.broadcast_to(points_m, (len(valid), *points_m.shape[1:]))
+    joints_m = track.world_from_object.inverse() @ recording.annotated.joints(recording.request.clip_id, side)[valid]
+    frames = np.linspace(0, len(valid) - 1, min(FIRST_FRAMES_MEASURED, len(valid))).astype(int)
+    while True:
+        joints_from_points = joints_m[frames][:, :, None] - points_m[frames][:, None]
+        shift = _shortest_clearing_move(joints_from_points.reshape(-1, 3), HANDS_AWAY_M)
+        nearest_m = [cdist(joints + shift, points).min() for joints, points in zip(joints_m, points_m, strict=True)]
+        if min(nearest_m) >= HANDS_AWAY_M - ROUNDING_M:
+            return _shifted(clip.hands[side], clip.object.world_from_object.rotation @ shift)
+        frames = np.append(frames, np.argmin(nearest_m))  # the shift has to clear this frame too
 
 
 def _shortest_clearing_move(offsets: np.ndarray, clear_m: float) -> np.ndarray:

@@ -84,7 +84,7 @@ class Pairing:
         return torch.from_numpy(examples.text), examples.prompts()
 
     def can_evaluate(self, examples: Examples) -> bool:
-        return len(examples) > 0
+        return len(set(examples.prompts().tolist())) > 1  # clips of one prompt have no negatives: any loss is 0
 
     def loss(
         self, network: MotionEncoder, logits: Tensor, targets: tuple[Tensor, ...], generator: torch.Generator | None

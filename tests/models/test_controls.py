@@ -16,6 +16,7 @@ from hoidata.metrics.target_contact import read_target_contact
 from hoidata.refinement import refine_grasps
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
+from models.baselines import controls
 from models.baselines.controls import HANDS_AWAY_M, PerturbedRecording
 from models.baselines.retrieval import Prompt, Retrieval, by_sentence, of_the_hand
 from models.common.family import Skipped, Sources
@@ -147,7 +148,11 @@ def test_a_moved_object_is_10_cm_away_and_the_hands_are_bit_identical(sources, a
                 np.testing.assert_array_equal(perturbed, true)
 
 
-def test_hands_away_move_rigidly_with_the_object(sources, annotated, test):
+@pytest.mark.parametrize("first_measured", [1, 8])
+def test_hands_away_move_rigidly_with_the_object_and_touch_it_in_no_frame(
+    sources, annotated, test, monkeypatch, first_measured
+):
+    monkeypatch.setattr(controls, "FIRST_FRAMES_MEASURED", first_measured)
     for sample in test:
         side, recorded = acting(sample), annotated.clip(sample.clip_id)
         (perturbed,) = motions(sources, "hands-away", sample, 1)

@@ -186,6 +186,15 @@ def test_clips_of_the_same_prompt_are_not_negatives():
     assert loss.item() == pytest.approx(np.mean(wrong), rel=1e-5)
 
 
+def test_clips_of_one_prompt_choose_no_epoch(annotated):
+    """Without negatives every loss is zero."""
+    train = Examples.of(annotated, "train")
+    assert len(set(train.prompts().tolist())) > 1
+    assert Pairing().can_evaluate(train)
+    same = {name: [getattr(train, name)[0]] * len(train) for name in ("verbs", "objects", "hands")}
+    assert not Pairing().can_evaluate(replace(train, **same))
+
+
 def test_rare_classes_weigh_more_and_untrained_labels_nothing(annotated):
     train = Examples.of(annotated, "train")
     task = Classification.of(train, "softmax")

@@ -204,6 +204,37 @@ def test_written_limits_are_used_if_the_training_clips_satisfy_them():
     assert violated.facts == {"limits": [], "learnt": {"lift": 10, "pour": 10}}
 
 
+def test_a_clip_without_gravity_changes_no_measure_that_needs_it():
+    numbers, rises = lifts_and_pours(0), ("rise_m", "tilt_deg", "turn_deg")
+    weightless = numbers["lift"][0] | dict.fromkeys(rises, float("nan"))
+    written = {"lift": {"rise_m": (0.1, 0.3)}}
+    without, mixed = (learn_actions(numbers | {"lift": lifts}, written) for lifts in (
+        numbers["lift"][1:], [weightless, *numbers["lift"][1:]]
+    ))  # fmt: skip
+    assert mixed.facts == without.facts == {"limits": ["lift"], "learnt": {"pour": 10}}
+    assert list(mixed.scale) == list(without.scale) == list(VERB_MEASURES)
+    for name in rises:
+        assert mixed.scale[name] == without.scale[name]
+        assert mixed.usual["lift"][name] == without.usual["lift"][name]
+        place = VERB_MEASURES.index(name)
+        assert mixed.centroids["lift"][place] == pytest.approx(without.centroids["lift"][place])
+    assert mixed.nearest_verb(weightless) is None
+    assert mixed.nearest_verb(numbers["lift"][0]) == "lift"
+
+
+def test_a_measure_that_no_clip_of_a_verb_has_tells_no_verbs_apart():
+    numbers = lifts_and_pours(0)
+    weightless = [clip | {"rise_m": float("nan")} for clip in numbers["lift"]]
+    few = [*weightless[:8], *numbers["lift"][8:]]
+    assert set(VERB_MEASURES) - set(learn_actions(numbers | {"lift": weightless}).scale) == {"rise_m"}
+    assert "rise_m" not in learn_actions(numbers | {"lift": few}).usual["lift"]  # two values bound nothing
+    assert "rise_m" in learn_actions(numbers | {"lift": few}).usual["pour"]
+
+
+def test_an_object_that_is_seen_in_one_frame_has_not_moved():
+    assert numbers_of(track(np.zeros((1, 3)))) == numbers_of(track(np.zeros((9, 3))))
+
+
 def test_limits_of_a_measure_that_is_nan_give_no_answer():
     actions = Actions({"lift": {"rise_m": (0, 1)}, "open": {"hinge_net_deg": (20, 90)}}, {}, {}, {})
     weightless = action_numbers(track(np.zeros((5, 3))), None, np.zeros((2, 5), bool))

@@ -135,6 +135,37 @@ def test_a_prediction_of_part_of_the_frames_is_compared_with_that_part(write_ann
     assert evaluation["counts"]["joint_error_mm"]["values"] == 7
 
 
+@pytest.mark.parametrize("first", [0, 1, 5, 12])
+def test_a_motion_numbered_from_zero_starts_at_the_first_frame_of_any_recording(
+    write_annotated, make_clip, tmp_path, first
+):
+    def longer(clip):
+        return replace(clip, source_frames=clip.source_frames + np.int32(first))
+
+    root, clips = write_annotated_dataset(
+        tmp_path / "later", lambda *args, **kwargs: longer(make_clip(*args, **kwargs))
+    )
+    part = [replace(clip.take(slice(0, 9)), source_frames=np.arange(9, dtype=np.int32)) for clip in clips.values()]
+    evaluation = evaluate_store(written(tmp_path / "part", part), root)
+    assert (evaluation["motions"], evaluation["left_out"]) == (2, [])
+    assert evaluation["figures"]["joint_error_mm"] == 0
+
+
+def test_frames_that_were_not_recorded_count_neither_for_nor_against_a_motion(make_clip, tmp_path):
+    """Every third frame of the recording is interpolated; a hand that touches there touched nothing."""
+
+    def gapped(*args, **kwargs):
+        clip = make_clip(*args, **kwargs)
+        frames = clip.source_frames.copy()
+        frames[2::3] = frames[1::3][: len(frames[2::3])]
+        return replace(clip, source_frames=frames)
+
+    root, clips = write_annotated_dataset(tmp_path / "gapped", gapped)
+    evaluation = evaluate_store(written(tmp_path / "same", clips.values()), root)
+    assert evaluation["figures"]["contact_f1"] == 1
+    assert evaluation["figures"]["contact_recall"] == 1
+
+
 def test_evaluation_uses_threshold_and_points_of_the_contact_stage(write_annotated, tmp_path):
     def of(folder, **settings):
         root, clips = write_annotated(**settings)

@@ -201,6 +201,22 @@ def test_realism_without_hands_is_one_only_in_free_fall(make_clip, pair_of):
     assert motion.floor_as_released(pair_of(slow, slow, table_m=-1.0), 1)[:-2].all()
 
 
+@pytest.mark.parametrize("lost", ["interpolated", "untracked"])
+def test_frames_in_which_a_hand_is_not_measured_are_not_unrealistic(make_clip, pair_of, lost):
+    clip = on_a_hand(make_clip)
+    measured = np.arange(clip.n_frames) % 3 != 2
+    if lost == "interpolated":
+        frames = np.where(measured, clip.source_frames, clip.source_frames - 1).astype(np.int32)
+        reference = replace(clip, source_frames=frames)
+    else:
+        reference = replace(clip, hands={side: replace(one, valid=measured) for side, one in clip.hands.items()})
+    for measure in (motion.realism_si, motion.realism_every_frame):
+        complete, partly = (measure(pair_of(clip, other, table_m=-1.0), 1) for other in (clip, reference))
+        assert complete.all()
+        assert partly.all()
+        assert len(partly) == measured.sum() < len(complete) == clip.n_frames
+
+
 def test_every_registered_metric_measures_what_its_name_says(make_clip, pair_of):
     """Motions on which the metrics of forces, meshes and derivatives all have different values."""
 

@@ -152,11 +152,15 @@ def test_a_leading_metric_that_was_not_measured_is_named_with_its_reason_apart_f
     without = {"deep_share": {"the object has no inside": 257}, "slip_cm_s": {"no such frame": 3}}
     (metrics / "ours.json").write_text(json.dumps({"figures": figures, "unmeasured": without}))
     (metrics / "whole.json").write_text(json.dumps({"figures": figures}))
-    write_leading_metrics(out, metrics, ["ours", "whole"])
+    (metrics / "none.json").write_text(json.dumps({"empty": "no diffusion network was trained"}))
+    write_leading_metrics(out, metrics, ["ours", "whole", "none"])
     assert json.loads(out.read_text()) == {
         "ours": figures,
         "whole": figures,
-        "not measured": {"ours": {"deep_share": "the object has no inside: 257 clips"}},
+        "not measured": {
+            "ours": {"deep_share": "the object has no inside: 257 clips"},
+            "none": {"empty": "no diffusion network was trained"},
+        },
     }
 
 
