@@ -13,8 +13,8 @@ def problems_of(path: Path) -> tuple[list[BadInput], str]:
     """All problems of an output, and a summary to print if there are none."""
     outputs = _outputs_at(path)
     problems = [item for root, lock, out in outputs for item in _changed_files(root, lock, out, path)]
-    files = [path] if path.is_file() else sorted(path.rglob("*.safetensors"))
-    problems += [problem for file in files if file.suffix == ".safetensors" and (problem := _broken_seal(file))]
+    files = [file for file in ([path] if path.is_file() else sorted(path.rglob("*"))) if file.suffix == ".safetensors"]
+    problems += [problem for file in files if (problem := _broken_seal(file))]
     summary = f"as written by {', '.join(lock.name for _, lock, _ in outputs[:3])}{' and others' * (len(outputs) > 3)}"
     if not (path / "meta").is_dir():
         if not outputs and not files:

@@ -281,7 +281,7 @@ def learn_actions(
     scale = {}
     for name in VERB_MEASURES:
         by_verb = [_finite(clips, name) for clips in numbers.values()]
-        if by_verb and all(by_verb):  # no clip of some verb: the measure cannot tell verbs apart
+        if by_verb and all(by_verb):  # each verb needs a value, or verbs could not be compared
             column = np.concatenate(by_verb)
             scale[name] = float(column.mean()), max(float(column.std()), MIN_DEVIATION[name.rpartition("_")[2]])
     usual = usual_limits(numbers, scale)
@@ -307,8 +307,8 @@ def usual_limits(
     """
     limits = dict[str, Limits]()
     for verb, clips in numbers.items():
-        known = {name: _finite(clips, name) for name in scale}
-        ranges = {name: _range(values, scale[name][1]) for name, values in known.items() if len(values) >= MIN_CLIPS}
+        columns = {name: _finite(clips, name) for name in scale}
+        ranges = {name: _range(values, scale[name][1]) for name, values in columns.items() if len(values) >= MIN_CLIPS}
         limits |= {verb: ranges} if ranges else {}
     return limits
 

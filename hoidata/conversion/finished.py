@@ -119,6 +119,8 @@ CODE_PATHS = (
     "hands",
     "geometry",
     "files",
+    "annotation",
+    "contact",
     "workers.py",
     "errors.py",
 )

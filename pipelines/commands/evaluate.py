@@ -47,7 +47,7 @@ def evaluate(
 
     # Of a dataset data/<profile>/<dataset>; the folder may not exist.
     encoders = trained_encoders(reference.parents[2] / StagePaths(reference.parent.name, reference.name).evaluators)
-    hands, chosen_metrics = hands_of_data(reference), select_metrics(filter(None, metrics.split(",")))
+    hands, chosen_metrics = hands_of_data(reference), select_metrics(filter(None, map(str.strip, metrics.split(","))))
     results = evaluate_store(
         store, reference, hands, split=split, metrics=chosen_metrics, encoders=encoders, jobs=jobs(), progress=True
     )
@@ -114,7 +114,7 @@ def table(
     families = sorted(path.stem for path in folder.glob("*.json"))
     of_project = (path := folder.resolve()).parent.parent.name == "metrics"
     stale = outdated_samples(path.parents[2], path.parent.name, path.name) if of_project else {}
-    typer.echo(markdown_table(folder, families, metrics.split(","), stale), nl=False)
+    typer.echo(markdown_table(folder, families, [name.strip() for name in metrics.split(",")], stale), nl=False)
 
 
 def controls(folder: Metrics) -> None:

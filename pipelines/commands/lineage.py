@@ -144,13 +144,15 @@ def check(
     With --against, compare data and networks with those of another machine's run. The exit code is 0 if all are
     unchanged, else 1.
     """
+    if target and against:
+        raise BadInput("--against", "all outputs of the project", f"with {target}", "omit one of them")
     here, root = Path.cwd(), enter_project()
     from pipelines.lineage.check import check as check_all
     from pipelines.lineage.check import compare_made, write_made
     from pipelines.lineage.targets import find_target
     from pipelines.params import read_params
 
-    chosen = find_target(root, target, here) if target and not against else None
+    chosen = find_target(root, target, here) if target else None
     nodes = compare_made(root, against) if against else check_all(root, chosen)
     deviating = [node for node in nodes if node.status != "same"]
     failed = [node for node in deviating if node.status != "recorded"]

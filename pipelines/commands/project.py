@@ -67,7 +67,8 @@ def remember_root(name: str, root: Path) -> None:
     roots = {**settings.get("roots", {}), name: str(root)}
     lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in sorted(roots.items())]
     head = "# Where your raw files lie. Written by `hoidata raw scan`.\n[roots]\n"
-    others = re.sub(rf"({re.escape(head)}|^\[roots\]\n)[^\[]*", "", text, flags=re.MULTILINE)
+    # The section ends at the next line, not character, that begins with a bracket: a path may have one.
+    others = re.sub(rf"({re.escape(head)}|^\[roots\]\n)(?:(?!\[).*\n?)*", "", text, flags=re.MULTILINE)
     path.write_text(f"{others.rstrip()}\n\n".lstrip() + head + "".join(lines))
 
 

@@ -5,6 +5,8 @@ It is derived from the store's facts and has no date, so that equal stores give 
 
 import re
 from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -56,6 +58,14 @@ CONTEXT: dict[str, Any] = {
     "description": {"@container": "@language"},
     **{name: f"cr:{name}" for name in _CR},
 }
+
+
+def selected(store: Store, clip_ids: Sequence[str]) -> Store:
+    """The store as if it had only some of its clips."""
+    rows = store.sequences.loc[list(clip_ids)]
+    objects = set(rows["object"]).union(*rows["other_objects"])
+    counts = {"clips": len(rows), "frames": int(rows["n_frames"].sum()), "objects": len(objects)}
+    return replace(store, sequences=rows, info=store.info | {"counts": store.info["counts"] | counts}, _rows={})
 
 
 def write_description(folder: Path, store: Store, form: Format, for_own_use: bool) -> None:
@@ -154,7 +164,7 @@ def _responsible(store: Store, form: Format) -> dict[str, Any]:
     """The responsible-AI terms of Croissant that the facts of a store provide."""
     info, counts, rows = store.info, store.info["counts"], store.sequences
     errors_m = rows["fit_error_m"].dropna().tolist()  # of hands fitted to keypoints
-    verbs = Counter(verbs_of(store).values())
+    verbs = Counter(verb for clip_id, verb in verbs_of(store).items() if clip_id in rows.index)
     verbs_by_count = sorted(verbs.items(), key=lambda pair: (-pair[1], str(pair[0])))
     limits = [f"gravity: {info['frame']['gravity']}"]
     if errors_m:

@@ -18,7 +18,7 @@ from hoidata.files import atomic_folder
 from hoidata.files.arrays import write_npz_to
 from hoidata.store.store import Store
 from pipelines.exports import bvh, hugging_face, lerobot, licences, spider, usd
-from pipelines.exports.describe import write_description
+from pipelines.exports.describe import selected, write_description
 from pipelines.exports.motion import CLIP_COLUMNS, COLUMNS, Y_UP, ExportedClip, Format, Source, write_json
 from pipelines.pages.glb import glb_bytes
 
@@ -110,7 +110,8 @@ def export_store(
             raise BadInput(store.folder, f"clips that {to} can represent", f"none: {reason}", "choose another format")
         facts = _facts(store, to, form, for_own_use) | {"clips": len(source.ids) - len(skipped), "left_out": skipped}
         write_json(partial / "export.json", facts)
-        write_description(partial, store, form, for_own_use)
+        shown = selected(store, [clip_id for clip_id in source.ids if clip_id not in skipped])
+        write_description(partial, shown, form, for_own_use)
     return facts
 
 

@@ -21,7 +21,7 @@ from pipelines.exports.licences import PERSON, Kind
 from pipelines.pages.glb import continuous_quaternions
 
 MAX_NAME_BYTES = 150  # file systems permit 255, including suffixes
-_ESCAPED = re.compile(r"^\.|(?<=_)_|[^\w .,+=@()#-]")  # "_" after "_": two mean "/"
+_ESCAPED = re.compile(r"^[._]|_$|(?<=_)_|[^\w .,+=@()#-]")  # "_" next to "_": two mean "/"
 WORLD = "the world frame of the clip"
 Y_UP = "rotated so that gravity is -y, y is up; not rotated if a clip's gravity is not known"
 
@@ -200,7 +200,9 @@ class Source:
         self._subsets = _grouped(root / "splits" / "splits.parquet", "split")
         self._verbs = verbs_of(store)
         # Clips of a subset follow each other, in the order of the store.
-        self.ids = sorted(clip_ids or store.ids, key=lambda clip_id: [*SUBSETS, ""].index(self._subset(clip_id)))
+        self.ids = sorted(
+            dict.fromkeys(clip_ids) or store.ids, key=lambda clip_id: [*SUBSETS, ""].index(self._subset(clip_id))
+        )
 
     def clip(self, clip_id: str) -> ExportedClip:
         """One clip with its joints and sentences."""

@@ -63,6 +63,13 @@ def _locked(name: str, body: dict[str, Any]) -> Locked:
     return Locked(name, params, digests("deps"), digests("outs"))
 
 
+def producers_of(makers: Mapping[str, str], path: str) -> list[str]:
+    """The stages with an output that is the path, in it or around it. makers: the stage of each output."""
+    folder = f"{path}/"
+    stages = [stage for out, stage in makers.items() if f"{out}/".startswith(folder) or folder.startswith(f"{out}/")]
+    return list(dict.fromkeys(stages))
+
+
 def dvc_digest(path: Path) -> str | None:
     """DVC's MD5 of a file or folder; None if it does not exist."""
     if path.is_file():
@@ -80,7 +87,7 @@ def _files_below(folder: Path) -> list[str]:
 
 def listing_digest(entries: Mapping[str, str]) -> str:
     """DVC's MD5 of a folder, from the MD5 of its files by path."""
-    listing = [{"md5": entries[path], "relpath": path} for path in sorted(entries, key=lambda path: path.split("/"))]
+    listing = [{"md5": entries[path], "relpath": path} for path in sorted(entries)]
     return hashlib.md5(json.dumps(listing, sort_keys=True).encode()).hexdigest() + ".dir"
 
 

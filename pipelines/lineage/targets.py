@@ -17,7 +17,15 @@ from hoidata.files.checksums import corrupted_part, payload_digest
 from hoidata.files.numpy_files import load_npz_objects
 from hoidata.files.written import read_json
 from pipelines.lineage.history import History
-from pipelines.lineage.locks import Locked, cached_listing, dvc_digest, lock_files, parse_locks, read_locks
+from pipelines.lineage.locks import (
+    Locked,
+    cached_listing,
+    dvc_digest,
+    lock_files,
+    parse_locks,
+    producers_of,
+    read_locks,
+)
 from pipelines.lineage.provenance import read_provenance
 
 WEIGHTS = "model.safetensors"
@@ -149,10 +157,10 @@ def _output(root: Path, name: str) -> Target:
 
 def lock_record(root: Path, locks: dict[str, Locked], stage: str) -> dict[str, Any]:
     """The entries of a stage and all upstream stages in dvc.lock, in the form of a checkpoint's provenance."""
-    producers, order = {out: lock.name for lock in locks.values() for out in lock.outs}, [stage]
+    makers, order = {out: lock.name for lock in locks.values() for out in lock.outs if (root / out).exists()}, [stage]
     for name in order:
-        inputs = (producers[path] for path in locks[name].deps if path in producers)
-        order += [producer for producer in inputs if producer not in (*order, "code")]
+        inputs = (producer for path in locks[name].deps for producer in producers_of(makers, path))
+        order += [producer for producer in dict.fromkeys(inputs) if producer not in (*order, "code")]
     stages = {name: _lock_stage(root, locks[name]) for name in dict.fromkeys(order)}
     return {"schema": SCHEMA_LOCK, "stage": stage, "stages": stages}
 

@@ -11,10 +11,10 @@ from hoidata.files.atomic import sha256_file
 from pipelines.lineage.digests import path_digest
 from pipelines.lineage.graph import Stage, look_up, written_graph
 from pipelines.lineage.history import History
-from pipelines.lineage.locks import dvc_digest, read_locks
+from pipelines.lineage.locks import dvc_digest, producers_of, read_locks
 from pipelines.lineage.raw import RawList, raw_list
 from pipelines.lineage.targets import Target, find_target
-from pipelines.params import chosen_params, load_yaml, read_params
+from pipelines.params import chosen_params, load_yaml, read_file, read_params
 
 Kind = Literal["checkpoint", "motion", "stage", "param", "code", "data", "manifest", "raw"]
 # From worst to best.
@@ -132,7 +132,8 @@ class _Comparison:
 
     @cached_property
     def params(self) -> dict[str, Any]:
-        return read_params(self.home)
+        """Today's params as the record has them: DVC's are those without the profile's overlay, which is code to it."""
+        return read_file(self.home / "params.yaml") if self.target.is_of_lock else read_params(self.home)
 
     @cached_property
     def stages_today(self) -> dict[str, Stage]:
@@ -215,7 +216,7 @@ class _Comparison:
             values = load_yaml(text)
             if "profile" in self.params:
                 values["profile"] = self.params["profile"]
-            return look_up(chosen_params(values), key)
+            return look_up(values if self.target.is_of_lock else chosen_params(values), key)
         except (BadInput, ValueError, TypeError, AttributeError, RecursionError):
             return None
 
@@ -247,8 +248,7 @@ class _Comparison:
 
     def input(self, path: str, recorded: str | None) -> Node:
         kind: Kind = "manifest" if path.startswith("manifests/") else "data"
-        producer = self.producers.get(path)
-        children = (self.stage(producer),) if producer else ()
+        children = tuple(self.stage(producer) for producer in producers_of(self.producers, path))
         algorithm = "md5" if self.target.is_of_lock else "sha256"
         digest = f"{algorithm} {recorded}" if recorded else ""
         status, detail = self.path_status(path, recorded)

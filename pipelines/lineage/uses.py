@@ -60,7 +60,9 @@ def comes_from(clip: RawClip, source: str) -> bool:
     """Whether ``source`` is the clip's id, its subject, one of its objects, or one of its raw files."""
     names = (clip.clip_id, clip.subject, *clip.objects)
     return source in names or any(
-        path == source or source.endswith(f"/{path}") or path.endswith(f"/{source}") for path in clip.files
+        # A clip lists a folder of frame files as one file.
+        f"/{source}".endswith(f"/{path}") or path.endswith(f"/{source}") or f"/{path}/" in f"/{source}"
+        for path in clip.files
     )
 
 

@@ -163,4 +163,7 @@ def write_json(path: Path, values: Any) -> None:
 
 def jobs() -> int:
     """The number of worker processes: HOIDATA_JOBS, else the available cores. It does not affect results."""
-    return int(os.environ.get("HOIDATA_JOBS", 0)) or len(os.sched_getaffinity(0))
+    text = os.environ.get("HOIDATA_JOBS", "")
+    if text and not text.isdecimal():
+        raise BadInput("HOIDATA_JOBS", "a number of processes", repr(text), "correct or unset it")
+    return int(text or 0) or len(os.sched_getaffinity(0))

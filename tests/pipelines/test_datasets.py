@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import tomllib
 from pathlib import Path
 
 import pandas as pd
@@ -105,3 +106,12 @@ def test_a_scan_keeps_the_other_sections_of_hoidata_toml(tmp_path: Path, monkeyp
     for line in ('old = "/a"', 'new = "/b"', 'paths = ["../kitchen"]'):
         assert first.count(line) == 1
     assert first.count("[roots]") == 1
+
+
+def test_a_raw_folder_may_have_brackets_in_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("hoidata.toml").write_text('[datasets]\npaths = ["../kitchen"]\n')
+    for name, folder in (("mano", "/mano [v1.2]"), ("grab", "[/grab"), ("mano", "/mano [v1.2]")):
+        remember_root(name, Path(folder))
+    settings = tomllib.loads(Path("hoidata.toml").read_text())
+    assert settings == {"roots": {"mano": "/mano [v1.2]", "grab": "[/grab"}, "datasets": {"paths": ["../kitchen"]}}

@@ -12,6 +12,8 @@ from hoidata.errors import BadInput, MissingResource
 from pipelines.cli import app
 from pipelines.lineage.graph import written_graph
 from pipelines.params import read_params
+from pipelines.stages.base import jobs
+from pipelines.validation import problems_of
 
 PROJECT = Path(__file__).parents[2]
 LOADED = "import sys; before = set(sys.modules); {}; print(*sorted(set(sys.modules) - before))"
@@ -63,6 +65,22 @@ def test_convert_gives_the_same_bytes_as_the_stage(tmp_path, monkeypatch, small_
     assert filecmp.cmpfiles(corpus.clips, "store", files, shallow=False)[1:] == ([], [])
     with pytest.raises(BadInput, match="a path that does not exist"):
         typed(*words)
+
+
+def test_a_file_that_no_stage_wrote_is_not_called_sound(tmp_path):
+    (tmp_path / "junk.npz").write_text("garbage")
+    with pytest.raises(MissingResource, match="is not a store, checkpoint or output of a stage"):
+        problems_of(tmp_path / "junk.npz")
+
+
+@pytest.mark.parametrize(("text", "count"), [("3", 3), ("abc", None), ("-1", None), ("1.5", None)])
+def test_the_number_of_processes_is_a_number(monkeypatch, text, count):
+    monkeypatch.setenv("HOIDATA_JOBS", text)
+    if count is None:
+        with pytest.raises(BadInput, match="HOIDATA_JOBS: expected a number of processes"):
+            jobs()
+    else:
+        assert jobs() == count
 
 
 def test_convert_requires_the_hand_model_that_real_files_need(tmp_path, monkeypatch, small_corpus):

@@ -216,8 +216,8 @@ def test_a_clip_without_gravity_changes_no_measure_that_needs_it():
     for name in rises:
         assert mixed.scale[name] == without.scale[name]
         assert mixed.usual["lift"][name] == without.usual["lift"][name]
-        place = VERB_MEASURES.index(name)
-        assert mixed.centroids["lift"][place] == pytest.approx(without.centroids["lift"][place])
+        number = VERB_MEASURES.index(name)
+        assert mixed.centroids["lift"][number] == pytest.approx(without.centroids["lift"][number])
     assert mixed.nearest_verb(weightless) is None
     assert mixed.nearest_verb(numbers["lift"][0]) == "lift"
 

@@ -218,6 +218,8 @@ def _tokens(text: str) -> list[Any]:
 def test_different_labels_give_different_file_names_in_the_same_folder():
     labels = [
         "a/b__c",
+        "a_/b",
+        "a/_b",
         "a/b/c",
         "a__b/c",
         "../c",

@@ -98,6 +98,16 @@ def test_annotated_verbs_replace_the_labels_in_the_description_and_in_sentences(
     assert verbs.endswith(f"2 verbs; most frequent: lift (1), {derived} (1)")
 
 
+def test_an_export_of_some_clips_describes_these_alone(store, tmp_path):
+    chosen = store.ids[1]
+    facts = export_store(store, "glb", tmp_path / "one", (chosen, chosen), progress=False)
+    assert facts["clips"] == 1
+    card, croissant = ((tmp_path / "one" / name).read_text() for name in ("README.md", "croissant.json"))
+    for text in (card, croissant):
+        assert "1 clips, 4 frames, 1 objects" in text
+        assert "1 subjects, 1 objects, 1 verbs; most frequent: open (1)" in text
+
+
 def test_spider_gets_tips_and_object_with_z_up_and_skips_unsupported_clips(store, exported):
     folder = exported["spider"]
     (path,) = folder.rglob("trajectory_keypoints.npz")

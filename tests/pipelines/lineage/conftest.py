@@ -53,7 +53,7 @@ stages:
   evaluate:
     matrix: *runs
     cmd: evaluate
-    deps: ["{CLIPS}", samples/embedded/grab/text2hoi]
+    deps: ["{CLIPS}", samples/embedded/grab]
     metrics: [metrics/embedded/grab/text2hoi.json: {{cache: false}}]
 """
 FAMILY = f"""

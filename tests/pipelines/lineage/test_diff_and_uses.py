@@ -18,8 +18,9 @@ from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from pipelines.lineage import provenance
 from pipelines.lineage.diff import differences
+from pipelines.lineage.raw import RawClip
 from pipelines.lineage.targets import find_target
-from pipelines.lineage.uses import uses
+from pipelines.lineage.uses import comes_from, uses
 
 CONTACT = "checkpoints/embedded/grab/contact"
 CLIPS = "data/embedded/grab/clips"
@@ -134,6 +135,17 @@ def test_a_checkpoint_lists_its_clips_without_the_store(ran):
 def test_a_source_that_nothing_uses_is_refused(ran):
     with pytest.raises(BadInput, match="nobody"):
         uses(ran.root, "nobody")
+
+
+def test_a_file_of_a_frame_concerns_the_clips_of_its_folder():
+    clip = RawClip("h2o/a", "subject2", ("mug",), (0, 9), ("subject2/h1/3/obj_pose", "subject2/h1/3/verb.txt"))
+    for source in (
+        "subject2/h1/3/obj_pose/000010.txt",
+        "obj_pose/000010.txt",
+        "/raw/subject2/h1/3/obj_pose/000010.txt",
+    ):
+        assert comes_from(clip, source) == (source != "obj_pose/000010.txt")
+    assert not comes_from(clip, "subject2/h1/3/obj_pose_rt/000010.txt")
 
 
 def test_a_network_uses_the_clips_of_the_network_it_builds_on(ran):

@@ -1,5 +1,6 @@
 """The status that ``hoidata lineage`` gives each node after some edit, on a project after a run."""
 
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -7,6 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from dvc_data.hashfile.hash_info import HashInfo
+from dvc_data.hashfile.meta import Meta
+from dvc_data.hashfile.tree import Tree
 
 from hoidata.errors import BadInput
 from hoidata.files.atomic import canonical_json, sha256_file
@@ -212,6 +216,34 @@ def test_stores_samples_and_metrics_have_a_lineage(ran, name):
     victim = path if path.is_file() else path / "meta/info.json"
     victim.write_text(victim.read_text() + " ")
     assert changed_nodes(ran.root, name)[f"data {name}"] == "tampered"
+
+
+def test_the_lineage_of_metrics_has_the_networks_of_their_motions(ran):
+    """The stage depends on the folder of all motions, of which each family's stage writes a part."""
+    name = "metrics/embedded/grab/text2hoi.json"
+    flip(ran.root / CONTACT, -1)
+    assert changed_nodes(ran.root, name)["data checkpoints/embedded/grab/contact"] == "tampered"
+    checked = check(ran.root, find_target(ran.root, name, ran.root))
+    assert {node.status for node in checked if "contact" in node.name} == {"tampered"}
+
+
+def test_an_overlay_of_the_profile_is_no_change_of_what_dvc_recorded(ran):
+    params = yaml.safe_load((ran.root / "params.yaml").read_text())
+    ran.write({"params.yaml": yaml.safe_dump({**params, "profiles": {"embedded": {"sample": {"seed": 5}}}})})
+    assert "changed" not in changed_nodes(ran.root, "samples/embedded/grab/text2hoi/clips").values()
+    ran.write({"params.yaml": yaml.safe_dump({**params, "sample": {"seed": 5}})})
+    assert changed_nodes(ran.root, "samples/embedded/grab/text2hoi/clips")["param sample"] == "changed"
+
+
+def test_a_folder_has_the_digest_that_dvc_gives_it(tmp_path):
+    """Names in the order of their characters: "-" is before "/"."""
+    tree = Tree()
+    for name in ("text2hoi/b", "text2hoi-coarse/a", "text2hoi.json", "Z"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(name)
+        tree.add(tuple(name.split("/")), Meta(), HashInfo("md5", hashlib.md5(name.encode()).hexdigest()))
+    tree.digest()
+    assert dvc_digest(tmp_path) == tree.hash_info.value
 
 
 def test_the_tree_of_a_generated_motion_has_its_networks(ran):
