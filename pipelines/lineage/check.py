@@ -15,10 +15,10 @@ from hoidata.files.atomic import write_whole
 from hoidata.files.checksums import corrupted_part, payload_digest
 from hoidata.files.written import read_json
 from hoidata.processor import processor_name
-from pipelines.lineage.locks import Locked, dvc_digest, other_files, read_locks
+from pipelines.lineage.locks import Locked, dvc_digest, other_files, producers_of, read_locks
 from pipelines.lineage.provenance import library_versions
 from pipelines.lineage.raw import RawList, raw_list
-from pipelines.lineage.targets import Target
+from pipelines.lineage.targets import Target, lock_record
 from pipelines.lineage.tree import Kind, Node, raw_folder
 
 SCHEMA = "hoidata.made/1"
@@ -28,10 +28,19 @@ SHOWN = 5
 def check(root: Path, target: Target | None = None) -> list[Node]:
     """One node per output, checkpoint and raw folder upstream of a target; without a target, of all stages that ran."""
     locks = read_locks(root)
-    upstream = target.record["stages"] if target and target.kind != "motion" else locks
-    outs = {path: locks[name] for name in locks.keys() & upstream.keys() for path in locks[name].outs}
+    upstream = _upstream(root, target, locks) if target else set(locks)
+    outs = {path: locks[name] for name in locks.keys() & upstream for path in locks[name].outs}
     outs.pop("code", None)  # every run writes it again
     return [node for path in sorted(outs) for node in _check_output(root, path, outs[path])]
+
+
+def _upstream(root: Path, target: Target, locks: dict[str, Locked]) -> set[str]:
+    """The stages behind a target; for a generated motion those behind its networks."""
+    if target.kind != "motion":
+        return set(target.record["stages"])
+    makers = {out: lock.name for lock in locks.values() for out in lock.outs}
+    trained = {stage for path in target.record for stage in producers_of(makers, path)}
+    return {name for stage in trained for name in lock_record(root, locks, stage)["stages"]}
 
 
 def _check_output(root: Path, path: str, lock: Locked) -> Iterator[Node]:

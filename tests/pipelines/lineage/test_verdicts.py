@@ -260,6 +260,15 @@ def test_the_tree_of_a_generated_motion_has_its_networks(ran):
     assert set(changed_nodes(None, str(motion)).values()) == {"recorded"}
 
 
+def test_a_check_of_a_generated_motion_is_one_of_its_networks_and_their_inputs(ran):
+    motion = ran.root / "generated/motion.npz"
+    motion.parent.mkdir()
+    np.savez(motion, checkpoints=np.array(canonical_json({CONTACT: sha256_file(ran.root / CONTACT)})))
+    names = {node.name for node in check(ran.root, find_target(ran.root, "generated", ran.root))}
+    assert {CONTACT, CLIPS} <= names
+    assert not [name for name in names if "length" in name or name.startswith(("samples", "metrics"))]
+
+
 @pytest.mark.parametrize(
     ("victim", "node_prefix"),
     [
