@@ -178,8 +178,8 @@ def _clustered(model: ObjectModel, cells: int) -> ObjectModel:
 def read_mesh_file(path: Path) -> Mesh:
     """Read vertices and triangles of an OBJ, PLY, STL or GLB file, in the file's unit and axes.
 
-    Coinciding vertices of STL and GLB are merged. The nodes of a GLB are in the frame of its scene. Raises BadInput:
-    the file holds no finite triangle mesh.
+    Vertices that no face uses are dropped, and coinciding vertices of STL and GLB merged. The nodes of a GLB are in
+    the frame of its scene. Raises BadInput: the file holds no finite triangle mesh.
     """
     return _joined(_read(path))
 
@@ -222,12 +222,13 @@ def _of_glb(glb: Glb) -> tuple[Mesh, list[NamedPieces]]:
 
 
 def _joined(file: _MeshFile) -> Mesh:
-    """Merge coinciding vertices of STL and GLB, and drop their unused vertices."""
-    if file.source is None:
-        return file.mesh
+    """Drop unused vertices, which belong to no surface, and merge coinciding vertices of STL and GLB."""
     used, corner = np.unique(file.mesh.faces, return_inverse=True)
-    first, number = distinct_rows(np.round(file.mesh.vertices[used] * MERGE_PRECISION))
-    return Mesh(file.mesh.vertices[used[first]], number[corner].reshape(-1, 3))
+    mesh = Mesh(file.mesh.vertices[used], corner.reshape(-1, 3))
+    if file.source is None:
+        return mesh
+    first, number = distinct_rows(np.round(mesh.vertices * MERGE_PRECISION))
+    return Mesh(mesh.vertices[first], number[mesh.faces])
 
 
 def _in_two_pieces(path: Path, file: _MeshFile, moving: Sequence[str]) -> tuple[Mesh, np.ndarray, tuple[str, str]]:

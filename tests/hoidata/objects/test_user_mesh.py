@@ -34,6 +34,24 @@ def test_a_mesh_that_stands_on_y_is_rotated_upright(tmp_path, suffix):
     assert user_object.notes[0].startswith("up: y (it stands on " if suffix == ".obj" else "y is up")
 
 
+@pytest.mark.parametrize("suffix", [".obj", ".ply"])
+def test_vertices_that_no_face_uses_do_not_change_size_or_up_axis(tmp_path, suffix):
+    path, stray = saved(MUG, tmp_path / f"mug{suffix}"), tmp_path / f"stray{suffix}"
+    vertices = np.insert(MUG.vertices, 5, [0, 0, -1], axis=0)
+    faces = MUG.faces + (MUG.faces >= 5)
+    trimesh.Trimesh(vertices, faces, process=False).export(stray)
+    expected, user_object = read_user_object(path), read_user_object(stray)
+    assert user_object.notes == expected.notes
+    np.testing.assert_array_equal(user_object.model.vertices_m, expected.model.vertices_m)
+    np.testing.assert_array_equal(user_object.model.faces, expected.model.faces)
+
+
+def test_vertices_that_no_face_uses_do_not_change_the_two_parts_of_a_hinge(tmp_path):
+    (tmp_path / "box.obj").write_text("v 0 0 -1\n" + obj_text(start=2) + "v 0 0 -1\n")
+    model = read_user_object(tmp_path / "box.obj", up="z", hinge="0,-0.1,0.04 1,0,0").model
+    assert [(model.vertices_of(part)[:, 2].min(), model.vertices_of(part)[:, 2].max()) for part in (0, 1)] == TWO_PARTS
+
+
 def test_a_glass_with_a_narrow_foot_is_rotated_upright(tmp_path):
     glass = trimesh.creation.revolve([[0, 0], [0.012, 0], [0.002, 0.01], [0.002, 0.08], [0.04, 0.12], [0, 0.12]])
     user_object = read_user_object(saved(glass, tmp_path / "glass.obj", transform=Y_UP))
@@ -164,8 +182,8 @@ BODY = pieces_of_boxes([0, 0, 0], [0.1, 0, 0], [0, 0.1, 0])  # a tray and two fe
 LID = pieces_of_boxes([0, 0, 0.05], [0, 0, 0.1])  # a plate and its knob
 
 
-def obj_text(letter="o", names=("body", "lid"), faces="f {} {} {}\n"):
-    text, start = "", 1
+def obj_text(letter="o", names=("body", "lid"), faces="f {} {} {}\n", start=1):
+    text = ""
     for name, piece in zip(names, (BODY, LID), strict=True):
         text += f"{letter} {name}\n" if name else ""
         text += "".join(f"v {x} {y} {z}\n" for x, y, z in piece.vertices.tolist())
