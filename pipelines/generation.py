@@ -17,6 +17,7 @@ from hoidata.contact.settings import ContactSettings
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
 from hoidata.metrics.verdict import verdict_lines
+from hoidata.object_paths.mesh_frame import Z
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.urdf import find_urdf
 from hoidata.objects.user_mesh import piece_names, read_user_object
@@ -51,6 +52,8 @@ class Models:
     clips: Path | None = None  # the store whose objects can be requested by name
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     points: int = ContactSettings.points  # sampled on the object's surface
+    # If ``clips`` are another dataset's: what is up for each of its training objects, (3,) in their frames.
+    object_ups: Mapping[str, Sequence[float]] | None = None
 
 
 @dataclass(frozen=True)
@@ -96,9 +99,12 @@ def generate_files(request: GenerationRequest, out: Path, store: Path | None = N
         remedy = "correct the path; a dataset's objects are available only in a project"
         raise BadInput("--object", "a mesh file (.obj, .ply, .stl, .glb)", str(request.object), remedy)
     notes += _missing_hinge_notes(verb, request.object, model)
+    up, up_notes = (Z, []) if user else _stored_up(model.name, models)
+    notes += up_notes
     generator = _generator(models, replace(models.sampling, **request.sampling))
     generator = replace(generator, model=generator.model.with_sampler(**request.sampler))
-    motions = generator.generate(wording.text, model, request.options, noun if user else None, as_stored=user is None)
+    words = noun if user else None
+    motions = generator.generate(wording.text, model, request.options, words, as_stored=up is None, up=up or Z)
     evidence, hand = motions[0].evidence, motions[0].evidence["hand"]
     if hand["source"] != "rule":
         notes.append(f"hand: {hand['hand']}, since {hand['evidence']} (--hand chooses another)")
@@ -112,6 +118,15 @@ def generate_files(request: GenerationRequest, out: Path, store: Path | None = N
     clips = [replace(motion.clip, verb=evidence["verb"]) for motion in motions]
     paths += write_motion_store(store, clips, hands, generator.model.facts)
     return WrittenFiles(paths, [*notes, *older_motion_notes(out, paths)], verdicts)
+
+
+def _stored_up(name: str, models: Models) -> tuple[Sequence[float] | None, list[str]]:
+    """What is up for an object of another dataset than the networks'; None if it is not, or if that is not known."""
+    if models.object_ups is None:
+        return None, []
+    up = models.object_ups.get(name)
+    unknown = f"{name!r} is of another dataset, without networks that know what is up for it: it may not stand upright"
+    return up, [] if up else [unknown]
 
 
 def load_generator(profile: str, dataset: str) -> Generator:
@@ -189,8 +204,9 @@ def _project_models(request: GenerationRequest, verb: str | None, noun: str | No
     """The models of the project that fit the sentence best, and the reason in words."""
     paths, reason = chosen_model(request, verb, noun)
     encoder, points, sampling = _profile_settings(paths.profile)
-    hands, clips = load_hands(paths.profile), _clips_with(request, paths)
-    return Models(paths.checkpoints, hands, encoder, clips, sampling, points), reason
+    hands, owner = load_hands(paths.profile), _dataset_with_object(request, paths)
+    object_ups = None if owner == paths else _object_ups(owner)
+    return Models(paths.checkpoints, hands, encoder, owner.clips, sampling, points, object_ups), reason
 
 
 def _profile_settings(profile: str) -> tuple[TextEncoder, int, SamplingConfig]:
@@ -206,10 +222,17 @@ def _sampling_settings(params: Mapping[str, Any]) -> SamplingConfig:
     return build_config(SamplingConfig, section, "params.yaml: sample.text2hoi")
 
 
-def _clips_with(request: GenerationRequest, paths: StagePaths) -> Path:
-    """The first store of clips that has the requested object: of the models' dataset, else of another one."""
+def _dataset_with_object(request: GenerationRequest, paths: StagePaths) -> StagePaths:
+    """The first dataset that has the requested object: the models', else another one."""
     runs = [paths, *(StagePaths(paths.profile, name) for name in request.datasets)]
-    return next((run.clips for run in runs if _has_object(run, request.object)), paths.clips)
+    return next((run for run in runs if _has_object(run, request.object)), paths)
+
+
+def _object_ups(paths: StagePaths) -> Mapping[str, Sequence[float]]:
+    """What is up for each training object of a dataset; empty if its network is not trained."""
+    if why_not_trained(paths, ["diffusion"]):
+        return {}
+    return read_info(paths.checkpoints / "diffusion" / FILE_NAME)["results"]["object_ups"]
 
 
 def _with_object_name(request: GenerationRequest) -> tuple[GenerationRequest, list[str]]:

@@ -5,6 +5,7 @@ zero in the first frame. All random numbers come from one seed: the same seed gi
 object with the axis up that is up in training; users get it in the frame of their mesh.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypedDict
@@ -132,19 +133,24 @@ class Generator:
         options: MotionOptions = MotionOptions(),
         object_words: str | None = None,
         as_stored: bool = False,
+        up: Sequence[float] = Z,
     ) -> list[GeneratedMotion]:
         """Motions for an English sentence on ``object`` (metres).
 
         Args:
-            as_stored: whether the object is one of the dataset's, in their frame. Other objects are z up. The networks
-                see them with the axis up that is up in most training clips.
+            as_stored: whether the object is one of the dataset's, in their frame. The networks see other objects with
+                the axis up that is up in most training clips.
+            up: direction of another object (3,) that is up; the nearest axis of its frame counts.
 
         Raises:
             BadInput: the text is not an English sentence, or the length is not within 8 to 150 frames.
         """
         wording = understood_words(text, self.vocabulary, lambda: self.encoder, force=True)
         hand, cloud = self._hand(text, options), sample_points(object, self.points)
-        rotation = np.eye(3, dtype=np.float32) if as_stored else training_from_z_up(self.object_ups)
+        object_from_z_up = training_from_z_up({object.name: up})
+        rotation = training_from_z_up(self.object_ups) @ object_from_z_up.T
+        if as_stored:
+            rotation = np.eye(3, dtype=np.float32)
         first = Request(
             motion_id=f"generated/{object.name}",
             object=turned(object, rotation),
@@ -168,16 +174,17 @@ class Generator:
                 clip, coarse = (
                     closed_as_stored(turned_back(one, object, rotation), self.hands) for one in (clip, coarse)
                 )
-            checks = self._verdict(clip, wording.verb, cloud, as_stored)
+            checks = self._verdict(clip, wording.verb, cloud, None if as_stored else object_from_z_up @ Z)
             motions.append(GeneratedMotion(clip, coarse, answer.touched.numpy(), cloud, evidence, checks))
         return motions
 
-    def _verdict(self, clip: Clip, verb: str | None, cloud: SampledPoints, as_stored: bool) -> tuple[Check, ...]:
-        up = self.object_ups.get(clip.object.model.name) if as_stored else Z
+    def _verdict(self, clip: Clip, verb: str | None, cloud: SampledPoints, up: np.ndarray | None) -> tuple[Check, ...]:
+        """The checks of a clip. up: (3,) direction of the object that is up; None: as in its training clips."""
+        known_up = self.object_ups.get(clip.object.model.name) if up is None else up
         points = ObjectPoints(cloud.points_m, cloud.normals, cloud.part)
         ranges = verb_ranges(self.model.trained["diffusion"], self.hands)
         requested = requested_verb(verb, self.vocabulary.verbs, ranges, clip, points)
-        return verdict(clip, self.hands, UNKNOWN_UP if up is None else np.asarray(up), requested)
+        return verdict(clip, self.hands, UNKNOWN_UP if known_up is None else np.asarray(known_up), requested)
 
     def _hand(self, text: str, options: MotionOptions) -> HandChoice:
         """The requested hand; otherwise the hand chosen from the sentence, or else by its frequency in training."""

@@ -23,6 +23,7 @@ from hoidata.batches.dataset import ClipBatch, HoiDataset
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.metrics.verb_ranges import VerbRanges
+from hoidata.object_paths.mesh_frame import turned
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.annotated import AnnotatedStore
@@ -36,7 +37,8 @@ from models.text2hoi.diffusion import MotionGenerator
 from models.text2hoi.generation import GeneratedMotion, Generator, MotionOptions
 from models.text2hoi.sampler import SamplingConfig
 from pipelines.command_inputs import stored_object
-from pipelines.generation import GenerationRequest, Models, generate_files
+from pipelines.generation import GenerationRequest, Models, _object_ups, generate_files
+from pipelines.stages.base import StagePaths
 from tests.models.toy import PARAMS, train
 
 
@@ -371,6 +373,42 @@ def test_generate_takes_user_meshes_as_z_up_and_keeps_the_frame_of_dataset_objec
     generate_files(request, tmp_path / "out")
     expected = generator(trained).generate(request.text, model, request.options, as_stored=of_dataset)[0].clip.object
     np.testing.assert_array_equal(np.load(tmp_path / "out" / "motion.npz")["object_rotvec"], expected.rotvec)
+
+
+def test_an_object_of_another_dataset_is_turned_upright_by_what_is_up_there_or_a_note_says_that_it_is_not_known(
+    request_for, trained: Path, annotated_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Generator, "object_ups", {"a": [0.0, 1.0, 0.0]})
+    clips = annotated_root / "clips"
+    stored = stored_object("box", clips, load_embedded_hands())
+    z_from_x = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    upright = {True: turned(stored, z_from_x), False: stored}
+    for is_known, model in upright.items():
+        ups = {"box": [0.99, 0.1, 0.0]} if is_known else {}
+        models = Models(trained, load_embedded_hands(), load_encoder("hash"), clips, object_ups=ups)
+        request = replace(request_for("Lift a box with the left hand.", models=models), object="box")
+        written = generate_files(request, tmp_path / f"{is_known}")
+        expected = generator(trained).generate(request.text, model, request.options, as_stored=not is_known)[0]
+        arrays = np.load(tmp_path / f"{is_known}" / "motion.npz")
+        track = replace(
+            expected.clip.object, model=stored, rotvec=arrays["object_rotvec"], hinge_rad=arrays.get("object_hinge_rad")
+        )
+        world_m = track.points_in_world(stored.vertices_m, stored.part)
+        expected_m = expected.clip.object.points_in_world(model.vertices_m, model.part)
+        np.testing.assert_allclose(world_m, expected_m, atol=1e-4)
+        assert any("it may not stand upright" in note for note in written.notes) == (not is_known)
+        assert any("degrees from upright" in line for line in written.verdict) == is_known
+
+
+def test_nothing_is_known_to_be_up_for_the_objects_of_a_dataset_without_networks(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    paths = StagePaths("embedded", "toy")
+    assert _object_ups(paths) == {}
+    paths.checkpoints.parent.mkdir(parents=True)
+    paths.checkpoints.symlink_to(trained)
+    assert set(_object_ups(paths)) == {"box", "notebook"}
 
 
 @pytest.mark.parametrize("name", ["steps", "batch", "validate_every", "micro_batches", "save_every"])

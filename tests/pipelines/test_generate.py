@@ -21,7 +21,7 @@ from pipelines.command_inputs import object_name
 from pipelines.generation import (
     GenerationRequest,
     Models,
-    _clips_with,
+    _dataset_with_object,
     _missing_hinge_notes,
     _networks,
     _project_models,
@@ -144,7 +144,7 @@ def test_the_verb_chooses_the_models_then_the_named_object_then_the_noun(
         "",
     )
     expected = StagePaths("embedded", holder or ("arctic" if name == "kettle" else dataset))
-    assert _clips_with(request, paths) == expected.clips
+    assert _dataset_with_object(request, paths) == expected
 
 
 @pytest.fixture
@@ -160,6 +160,20 @@ def models_of(tmp_path, monkeypatch) -> Callable[..., Models]:
     monkeypatch.setattr("pipelines.generation.load_hands", lambda profile: profile)
     monkeypatch.setattr("pipelines.generation.load_encoder", lambda name: name)
     return load
+
+
+@pytest.mark.parametrize(
+    ("name", "ups"), [("mug", None), ("kettle", "ups of arctic"), ("file.stl", None)], ids=["own", "other", "file"]
+)
+def test_what_is_up_for_an_object_of_another_dataset_comes_from_that_dataset(
+    name: str, ups: str | None, three_datasets, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "params.yaml").write_text((PROJECT / "params.yaml").read_text())
+    monkeypatch.setattr("pipelines.generation.load_encoder", lambda name: name)
+    monkeypatch.setattr("pipelines.generation._object_ups", lambda paths: f"ups of {paths.dataset}")
+    models, _ = _project_models(GenerationRequest("", name, "embedded", three_datasets, model="grab"), "pour", None)
+    assert models.object_ups == ups
 
 
 PARAMS = yaml.safe_load((PROJECT / "params.yaml").read_text())
