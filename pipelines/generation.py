@@ -7,6 +7,8 @@ from operator import add
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hoidata.actions.action import written_limits
 from hoidata.annotation.encoders import TextEncoder, load_encoder, not_clip_note
 from hoidata.annotation.prompts import further_verbs, read_sentence
@@ -17,7 +19,7 @@ from hoidata.contact.settings import ContactSettings
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
 from hoidata.metrics.verdict import verdict_lines
-from hoidata.object_paths.mesh_frame import Z
+from hoidata.object_paths.mesh_frame import Z, axis_turned_back, opening_upwards
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.urdf import find_urdf
 from hoidata.objects.user_mesh import piece_names, read_user_object
@@ -25,7 +27,7 @@ from hoidata.settings import build_config
 from hoidata.store.store import open_store
 from models.common.checkpoints import FILE_NAME, read_info
 from models.common.repeatable import make_repeatable
-from models.text2hoi.generation import Generator, MotionOptions
+from models.text2hoi.generation import GeneratedMotion, Generator, MotionOptions
 from models.text2hoi.sampler import SamplingConfig
 from pipelines.command_inputs import (
     MeshOptions,
@@ -104,7 +106,16 @@ def generate_files(request: GenerationRequest, out: Path, store: Path | None = N
     generator = _generator(models, replace(models.sampling, **request.sampling))
     generator = replace(generator, model=generator.model.with_sampler(**request.sampler))
     words = noun if user else None
-    motions = generator.generate(wording.text, model, request.options, words, as_stored=up is None, up=up or Z)
+    opening, limits = opening_upwards(model, user.joint_limits if user else None)
+    motions = generator.generate(
+        wording.text, opening, request.options, words, as_stored=up is None, up=up or Z, joint_limits=limits
+    )
+    notes += _limit_notes(motions, limits)
+    if opening is not model:
+        motions = [
+            replace(one, clip=axis_turned_back(one.clip, model), coarse=axis_turned_back(one.coarse, model))
+            for one in motions
+        ]
     evidence, hand = motions[0].evidence, motions[0].evidence["hand"]
     if hand["source"] != "rule":
         notes.append(f"hand: {hand['hand']}, since {hand['evidence']} (--hand chooses another)")
@@ -176,6 +187,18 @@ def _slide_notes(model: ObjectModel) -> list[str]:
         return []
     slide = f"{100 * model.joint_scale:.0f} cm"
     return [f"the networks were trained on hinges: one radian of a network slides this part by {slide}"]
+
+
+def _limit_notes(motions: Sequence[GeneratedMotion], limits: tuple[float, float] | None) -> list[str]:
+    """A note on the motions whose joint reaches its highest position, beyond which the networks' motion was cut."""
+    angles_rad = {one.evidence["number"] + 1: one.clip.object.hinge_rad for one in motions}
+    cut = [
+        str(number)
+        for number, angle_rad in angles_rad.items()
+        if limits is not None and angle_rad is not None and angle_rad.max() >= np.float32(limits[1])
+    ]
+    note = f"sample {', '.join(cut)}: the joint stops at the limit of its URDF, beyond which the networks moved it"
+    return [note] if cut else []
 
 
 def _wording(request: GenerationRequest) -> Wording:

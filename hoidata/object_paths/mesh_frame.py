@@ -47,17 +47,49 @@ def turned_back(clip: Clip, model: ObjectModel, rotation: np.ndarray) -> Clip:
 
 def closed_as_stored(clip: Clip, hands: HandPair) -> Clip:
     """The clip with the least hinge angle at 0, as the mesh is stored; hands on the moving part move with it."""
+    hinge_rad = clip.object.hinge_rad
+    return clip if hinge_rad is None else _joint_moved(clip, np.full(clip.n_frames, -hinge_rad.min()), hands)
+
+
+def within_limits(clip: Clip, limits: tuple[float, float] | None, hands: HandPair) -> Clip:
+    """The clip with joint positions, radians or metres, cut at the limits; hands on the moving part move with it."""
+    hinge_rad = clip.object.hinge_rad
+    if hinge_rad is None or limits is None or (limits[0] <= hinge_rad.min() and hinge_rad.max() <= limits[1]):
+        return clip
+    return _joint_moved(clip, np.clip(hinge_rad, *limits) - hinge_rad, hands)
+
+
+def opening_upwards(
+    model: ObjectModel, limits: tuple[float, float] | None
+) -> tuple[ObjectModel, tuple[float, float] | None]:
+    """The object and its joint limits with the axis turned round if most of the range is negative.
+
+    In most training clips, positions grow as an object opens.
+    """
+    if model.hinge is None or limits is None or -limits[0] <= limits[1]:
+        return model, limits
+    return replace(model, hinge=replace(model.hinge, axis=-model.hinge.axis)), (-limits[1], -limits[0])
+
+
+def axis_turned_back(clip: Clip, model: ObjectModel) -> Clip:
+    """The clip with the object ``model``, whose joint has the opposite axis."""
+    assert clip.object.hinge_rad is not None
+    return replace(clip, object=replace(clip.object, model=model, hinge_rad=0.0 - clip.object.hinge_rad))
+
+
+def _joint_moved(clip: Clip, change_rad: np.ndarray, hands: HandPair) -> Clip:
+    """The clip with joint positions changed by ``change_rad`` (frame,); hands on the moving part move with it."""
     track, tracks = clip.object, dict(clip.hands)
     if track.hinge_rad is None or track.model.hinge is None:
         return clip
-    least_rad, world_from_object = track.hinge_rad.min(), track.world_from_object
-    moved = world_from_object @ track.model.hinge.turn(np.full(clip.n_frames, -least_rad)) @ world_from_object.inverse()
+    world_from_object = track.world_from_object
+    moved = world_from_object @ track.model.hinge.turn(change_rad) @ world_from_object.inverse()
     for side, hand in clip.hands.items():
         if hand.valid.any() and _nearest_part(clip, side, hands) == 1:
             wrist_m = (moved @ hand.wrist_m[:, None].astype(np.float64))[:, 0].astype(np.float32)
             rotation = moved.rotation @ rotvec_to_rotmat(hand.global_orient.astype(np.float64))
             tracks[side] = replace(hand, wrist_m=wrist_m, global_orient=rotmat_to_rotvec(rotation).astype(np.float32))
-    return replace(clip, hands=tracks, object=replace(track, hinge_rad=track.hinge_rad - least_rad))
+    return replace(clip, hands=tracks, object=replace(track, hinge_rad=track.hinge_rad + change_rad))
 
 
 def _nearest_part(clip: Clip, side: Side, hands: HandPair) -> int:

@@ -24,7 +24,7 @@ from hoidata.errors import BadInput
 from hoidata.files import sha256_file
 from hoidata.hands import HandPair, load_embedded_hands
 from hoidata.metrics.verdict import UNKNOWN_UP, Check, requested_verb, verdict
-from hoidata.object_paths.mesh_frame import Z, closed_as_stored, training_from_z_up, turned, turned_back
+from hoidata.object_paths.mesh_frame import Z, closed_as_stored, training_from_z_up, turned, turned_back, within_limits
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import POINT_COUNT, SampledPoints, sample_points
 from models.common.checkpoints import FILE_NAME, refuse_other_inputs
@@ -134,6 +134,7 @@ class Generator:
         object_words: str | None = None,
         as_stored: bool = False,
         up: Sequence[float] = Z,
+        joint_limits: tuple[float, float] | None = None,
     ) -> list[GeneratedMotion]:
         """Motions for an English sentence on ``object`` (metres).
 
@@ -141,6 +142,7 @@ class Generator:
             as_stored: whether the object is one of the dataset's, in their frame. The networks see other objects with
                 the axis up that is up in most training clips.
             up: direction of another object (3,) that is up; the nearest axis of its frame counts.
+            joint_limits: lowest and highest joint position of another object, radians or metres; not left.
 
         Raises:
             BadInput: the text is not an English sentence, or the length is not within 8 to 150 frames.
@@ -171,9 +173,8 @@ class Generator:
             evidence = self._evidence(request, answer, hand, options, object_words or wording.noun)
             clip, coarse = answer.clip, motion_clip(request, answer.coarse, answer.object, evidence["synthetic"])
             if not as_stored:
-                clip, coarse = (
-                    closed_as_stored(turned_back(one, object, rotation), self.hands) for one in (clip, coarse)
-                )
+                closed = [closed_as_stored(turned_back(one, object, rotation), self.hands) for one in (clip, coarse)]
+                clip, coarse = (within_limits(one, joint_limits, self.hands) for one in closed)
             checks = self._verdict(clip, wording.verb, cloud, None if as_stored else object_from_z_up @ Z)
             motions.append(GeneratedMotion(clip, coarse, answer.touched.numpy(), cloud, evidence, checks))
         return motions

@@ -20,6 +20,7 @@ from torch import nn
 from hoidata.actions.action import Actions
 from hoidata.annotation.encoders import load_encoder
 from hoidata.batches.dataset import ClipBatch, HoiDataset
+from hoidata.clips.clip import ObjectTrack
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.metrics.verb_ranges import VerbRanges
@@ -39,6 +40,7 @@ from models.text2hoi.sampler import SamplingConfig
 from pipelines.command_inputs import stored_object
 from pipelines.generation import GenerationRequest, Models, _object_ups, generate_files
 from pipelines.stages.base import StagePaths
+from tests.builders.urdf import write_laptop
 from tests.models.toy import PARAMS, train
 
 
@@ -398,6 +400,37 @@ def test_an_object_of_another_dataset_is_turned_upright_by_what_is_up_there_or_a
         np.testing.assert_allclose(world_m, expected_m, atol=1e-4)
         assert any("it may not stand upright" in note for note in written.notes) == (not is_known)
         assert any("degrees from upright" in line for line in written.verdict) == is_known
+
+
+def test_the_joint_of_a_urdf_stays_within_its_limits_and_opens_in_its_direction(
+    request_for, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A lid that opens to negative angles moves as one with the opposite axis that opens to positive angles."""
+    vertices_m, notes = {}, {}
+    for name, axis, limits in (
+        ("up", "-1 0 0", (0, 0.001)),
+        ("down", "1 0 0", (-0.001, 0)),
+        ("wide", "1 0 0", (-3, 1)),
+    ):
+        text = write_laptop(tmp_path / name).read_text()
+        text = text.replace('axis xyz="-1 0 0"', f'axis xyz="{axis}"')
+        text = text.replace('lower="0" upper="2"', f'lower="{limits[0]}" upper="{limits[1]}"')
+        (tmp_path / name / "laptop.urdf").write_text(text)
+        request = request_for("Open a laptop with the left hand.")
+        notes[name] = generate_files(
+            replace(request, object=tmp_path / name / "laptop.urdf", force=True), tmp_path / f"{name} out"
+        ).notes
+        arrays = np.load(tmp_path / f"{name} out" / "motion.npz")
+        hinge_rad = arrays["object_hinge_rad"]
+        assert limits[0] - 1e-6 <= hinge_rad.min() < hinge_rad.max() <= limits[1] + 1e-6
+        assert (hinge_rad >= 0).all() == (name == "up")
+        model = read_user_object(tmp_path / name / "laptop.urdf").model
+        np.testing.assert_allclose(arrays["object_hinge_axis"], model.hinge.axis)
+        track = ObjectTrack(model, arrays["object_rotvec"], arrays["object_translation_m"], hinge_rad)
+        vertices_m[name] = track.points_in_world(model.vertices_m, model.part)
+    np.testing.assert_allclose(vertices_m["down"], vertices_m["up"], atol=1e-6)
+    has_note = {name: any("the joint stops at the limit" in note for note in of_one) for name, of_one in notes.items()}
+    assert has_note == {"up": True, "down": True, "wide": False}
 
 
 def test_nothing_is_known_to_be_up_for_the_objects_of_a_dataset_without_networks(
