@@ -511,6 +511,9 @@ def _skipped_hand_notes(trajectories: TrajectoryFile, given: AnimationInput, sid
 
 def _objects(options: AnimationOptions, unit: str, project: ProjectData) -> tuple[dict[Side, ObjectModel], list[str]]:
     """The object of each hand, by default one for both; and notes for the user."""
+    of_object = replace(options.mesh, unit="") if is_object_path(options.left_object) else options.mesh
+    if not is_object_path(options.object):  # a dataset's object has a scale, but no other of these options
+        replace(of_object, scale=1.0).check_for(options.object)
     model, notes = _object(options, unit, project)
     if not options.left_object:
         return dict.fromkeys(SIDES, model), notes

@@ -1,7 +1,7 @@
 """Inputs and results that `hoidata generate`, `animate` and `hands` share: mesh options, objects, trained networks."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
-from hoidata.objects.user_mesh import unknown_object_words
+from hoidata.objects.user_mesh import is_object_path, unknown_object_words
 from hoidata.store.info import generated_info
 from hoidata.store.store import open_store, write_store
 from models.common.checkpoints import FILE_NAME, read_info
@@ -35,6 +35,14 @@ class MeshOptions:
     hinge: str = ""
     moving: str = ""
     scale: float = 1.0  # factor on the mesh
+
+    def check_for(self, name: str) -> None:
+        """Raise BadInput for options that are set although ``name`` is not the path of a file."""
+        chosen = [option.name for option in fields(self) if getattr(self, option.name) != option.default]
+        if chosen and not (is_object_path(name) or Path(name).suffix):
+            options = ", ".join(f"--{option}" for option in chosen)
+            expected = "a mesh file, without which they have no effect"
+            raise BadInput(options, expected, name or "none", "omit what has no effect, or give a mesh file")
 
 
 @dataclass(frozen=True)

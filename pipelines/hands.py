@@ -130,8 +130,7 @@ def object_motion(options: HandsOptions, project: ProjectData) -> ObjectMotion:
     """The object motion that the options select. Raises BadInput if they select none, or one that is too long."""
     check_dataset(options.model, project)
     sources = [name for name in ("keyframes", "clip", "motion") if getattr(options, name)]
-    if options.mesh.scale != 1 and not is_object_path(options.object):
-        raise BadInput("--scale", "a mesh file whose size to change", options.object or "none", "omit it")
+    options.mesh.check_for(options.object)
     if len(sources) != 1:
         got = " and ".join(f"--{name}" for name in sources) or "none"
         raise BadInput("object's motion", "one of --keyframes, --clip or --motion", got, "give one of them")

@@ -379,6 +379,12 @@ def test_motion_of_a_network_trained_on_synthetic_clips_is_marked(tiny: Path, ty
         (("demo1.txt", "--object", "cyl_med.obj", "--fingers", "left"), "has left and right, near the object right"),
         (("mine.csv", "--object", "mug.obj", "--way", "interpolate"), "no poses to interpolate between"),
         (("mine.csv", "--object", "mug.obj", "--model", "nope"), "params.yaml: toy, got nope"),
+        (("mine.csv", "--object", "box", "--unit", "cm"), "--unit: expected a mesh file"),
+        (("mine.csv", "--object", "box", "--hinge", "1,0,0", "--moving", "a"), "--hinge, --moving: expected a mesh"),
+        (
+            ("tea.csv", "--object", "box", "--left-object", "pot.obj", "--moving", "a", "--unit", "m"),
+            "^--moving: expected a mesh",
+        ),
         (("mine.cvs",), r"\.csv, \.npz, \.txt"),
         (("demo1.txt.gz",), "gunzip"),
         ((TRAINED, "--object", "mug.obj"), "--object: expected no such option with a clip"),

@@ -159,6 +159,13 @@ def test_the_object_motion_of_a_generated_file_keeps_mesh_and_hinge(tmp_path):
         ({"keyframes": "time_s,hinge_deg 0,0 1,10"}, "--hinge"),
         ({"keyframes": REST, "mesh": MeshOptions("m")}, "--unit cm"),
         ({"keyframes": REST, "object": "box", "mesh": MeshOptions(scale=2.0)}, "--scale: expected a mesh file"),
+        (
+            {"keyframes": REST, "object": "box", "mesh": MeshOptions("cm", "y", HINGE, "lid")},
+            "--unit, --up, --hinge, --moving: expected a mesh file",
+        ),
+        ({"clip": "a", "object": "", "mesh": MeshOptions("cm")}, "--unit: expected a mesh file"),
+        ({"motion": "a.npz", "object": "", "mesh": MeshOptions(up="y")}, "--up: expected a mesh file"),
+        ({"keyframes": REST, "object": "nothing.obj", "mesh": MeshOptions("cm")}, "correct the path"),
         ({"keyframes": REST, "hinge_range": "110"}, "0:110"),
         ({"keyframes": REST, "hinge_range": "10:110"}, "0:110"),
         (
