@@ -96,8 +96,7 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
     lengths = [f"{shown.clip.n_frames} frames, {shown.clip.n_frames / FPS:.2f} s at {FPS} fps" for shown in motions]
     digests = ", ".join(f"{name} {digest[:12]}" for name, digest in evidence["checkpoints"].items())
     attempts = {_sample(shown): count for shown in motions if (count := shown.evidence["attempts"]) > 1}
-    others = "motions; the others did not carry the object or moved unlike the verb"
-    resampled = [f"{sample}: the best of {count} {others}" for sample, count in attempts.items()]
+    resampled = [f"{sample}: the best of {count} motions" for sample, count in attempts.items()]
     compared = [f"{_sample(shown)}: {words}" for shown in motions if (words := _compared(shown))]
     return [
         ("hands", f"{hand['hand']} (decided by {hand['source']}: {hand['evidence']})"),

@@ -2,8 +2,8 @@
 
 Hands are skinned meshes on MANO's 16 joints. Their shape (mean betas of the valid frames, or the personal template) is
 baked into the rest mesh. glTF skins cannot represent pose correctives and more than four joint weights per vertex, so
-these are dropped; the embedded hand has neither. A hand without valid frames is not in the file, and a hand is scaled
-to zero in invalid frames. The node "world" rotates gravity to glTF's -y.
+these are dropped; the embedded hand has correctives of up to 1.5 mm, and at most four weights. A hand without valid
+frames is not in the file, and a hand is scaled to zero in invalid frames. The node "world" rotates gravity to -y.
 """
 
 from collections.abc import Mapping

@@ -113,7 +113,7 @@ def test_page_names_seed_hands_length_models_and_untrained_inputs(motion, write)
         "Lift a box &amp; hold it",
         "1 of 1 checks fail: touches",
         "3 cm &lt;away&gt;",
-        "sample 1: the best of 3 motions",
+        "sample 1: the best of 3 motions<",
         "sample 1: motion classified as &#39;pour&#39;, highest rise 15.8 cm (usual: &lt;19.1&gt; to 23.7)",
     ):
         assert words in page, words
