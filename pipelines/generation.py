@@ -107,9 +107,7 @@ def generate_files(request: GenerationRequest, out: Path, store: Path | None = N
     generator = replace(generator, model=generator.model.with_sampler(**request.sampler))
     words = noun if user else None
     opening, limits = opening_upwards(model, user.joint_limits if user else None)
-    motions = generator.generate(
-        wording.text, opening, request.options, words, as_stored=up is None, up=up or Z, joint_limits=limits
-    )
+    motions = generator.generate(wording.text, opening, request.options, words, up, limits)
     notes += _limit_notes(motions, limits)
     if opening is not model:
         motions = [

@@ -110,8 +110,7 @@ class Generator:
             encoder: the encoder that the networks name if None; CLIP must be given, with its file.
             points: sampled on an object, as many as in training.
 
-        Raises:
-            BadInput: a network is missing, or was trained with another hand model or encoder.
+        Raises BadInput: a network is missing, or was trained with another hand model or encoder.
         """
         hands = hands or load_embedded_hands()
         model = Text2Hoi.load(checkpoints, hands, sampling, device)
@@ -132,27 +131,22 @@ class Generator:
         object: ObjectModel,
         options: MotionOptions = MotionOptions(),
         object_words: str | None = None,
-        as_stored: bool = False,
-        up: Sequence[float] = Z,
+        up: Sequence[float] | None = Z,
         joint_limits: tuple[float, float] | None = None,
     ) -> list[GeneratedMotion]:
         """Motions for an English sentence on ``object`` (metres).
 
         Args:
-            as_stored: whether the object is one of the dataset's, in their frame. The networks see other objects with
-                the axis up that is up in most training clips.
-            up: direction of another object (3,) that is up; the nearest axis of its frame counts.
-            joint_limits: lowest and highest joint position of another object, radians or metres; not left.
+            up: (3,) what is up for an object that is none of the dataset's, in its frame; None for one of the
+                dataset's. The networks see other objects with the axis up that is up in most training clips.
+            joint_limits: lowest and highest joint position, radians or metres, at which a motion is cut.
 
-        Raises:
-            BadInput: the text is not an English sentence, or the length is not within 8 to 150 frames.
+        Raises BadInput: the text is not an English sentence, or the length is not within 8 to 150 frames.
         """
         wording = understood_words(text, self.vocabulary, lambda: self.encoder, force=True)
         hand, cloud = self._hand(text, options), sample_points(object, self.points)
-        object_from_z_up = training_from_z_up({object.name: up})
-        rotation = training_from_z_up(self.object_ups) @ object_from_z_up.T
-        if as_stored:
-            rotation = np.eye(3, dtype=np.float32)
+        to_training = training_from_z_up(self.object_ups)
+        rotation = np.eye(3, dtype=np.float32) if up is None else to_training @ training_from_z_up({"": up}).T
         first = Request(
             motion_id=f"generated/{object.name}",
             object=turned(object, rotation),
@@ -172,20 +166,20 @@ class Generator:
             answer = self.model.answers([request])[0]
             evidence = self._evidence(request, answer, hand, options, object_words or wording.noun)
             clip, coarse = answer.clip, motion_clip(request, answer.coarse, answer.object, evidence["synthetic"])
-            if not as_stored:
+            if up is not None:
                 closed = [closed_as_stored(turned_back(one, object, rotation), self.hands) for one in (clip, coarse)]
                 clip, coarse = (within_limits(one, joint_limits, self.hands) for one in closed)
-            checks = self._verdict(clip, wording.verb, cloud, None if as_stored else object_from_z_up @ Z)
+            checks = self._verdict(clip, wording.verb, cloud, self.object_ups.get(object.name) if up is None else up)
             motions.append(GeneratedMotion(clip, coarse, answer.touched.numpy(), cloud, evidence, checks))
         return motions
 
-    def _verdict(self, clip: Clip, verb: str | None, cloud: SampledPoints, up: np.ndarray | None) -> tuple[Check, ...]:
-        """The checks of a clip. up: (3,) direction of the object that is up; None: as in its training clips."""
-        known_up = self.object_ups.get(clip.object.model.name) if up is None else up
+    def _verdict(
+        self, clip: Clip, verb: str | None, cloud: SampledPoints, up: Sequence[float] | None
+    ) -> tuple[Check, ...]:
         points = ObjectPoints(cloud.points_m, cloud.normals, cloud.part)
         ranges = verb_ranges(self.model.trained["diffusion"], self.hands)
         requested = requested_verb(verb, self.vocabulary.verbs, ranges, clip, points)
-        return verdict(clip, self.hands, UNKNOWN_UP if known_up is None else np.asarray(known_up), requested)
+        return verdict(clip, self.hands, UNKNOWN_UP if up is None else np.asarray(up), requested)
 
     def _hand(self, text: str, options: MotionOptions) -> HandChoice:
         """The requested hand; otherwise the hand chosen from the sentence, or else by its frequency in training."""

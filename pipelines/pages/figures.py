@@ -99,7 +99,7 @@ class Subject:
         hinge = model.hinge and replace(model.hinge, origin_m=model.hinge.origin_m * size)
         model = replace(model, vertices_m=(model.vertices_m * size).astype(model.vertices_m.dtype), hinge=hinge)
         options = MotionOptions(samples=samples)
-        return self.generator.generate(prompt, model, options, self.clip.object_words, as_stored=True)
+        return self.generator.generate(prompt, model, options, self.clip.object_words, up=None)
 
     def panel(self, caption: str, clip: Clip, paint: ContactPaint | None = None, note: str = "") -> Panel:
         """A panel with one player; ``paint``: a contact map."""
