@@ -22,6 +22,12 @@ HAND_PHRASE = re.compile(
     r"\b(?:with|by)\s+(?:(?:only|just)\s+)?(?:(?:the|your|my|his|her|their|a|one)\s+)?(?:single\s+)?hand\b|"
     r"\busing\s+(?:(?:only|just)\s+)?(?:the|your|my|his|her|their|a|one)\s+(?:single\s+)?hand\b"
 )
+# A clause that negates an action, and not a hand: "but do not close it", "without closing it".
+_NEGATED = re.compile(
+    r"\b(?:(?:(?:do|does|did|is|are|must|should)\s+)?not(?!\s+(?:only|just)\b)|(?:do|does|did)n['’]?t|never|without|"
+    r"instead\s+of|rather\s+than)\b(?!(?:\s+(?:use|using|with|in|by|the|your|my|his|her|their))*\s+"
+    r"(?:¤|(?:left|right|both|one|two|hands?)\b)).*?(?=[,;:.!?&]|\b(?:and|then|but)\b|$)"
+)
 # The words before the verb in "A knife is used by the right hand to chop".
 _PURPOSE = re.compile(r"\b(?:hold|holds|held|holding|use|uses|used|using)\b.*\bto $")
 
@@ -62,10 +68,11 @@ class Lexicon:
     def read(self, text: str) -> tuple[str | None, str | None]:
         """Find the verb and the object of a sentence, base forms.
 
-        Hand phrases are skipped. A verb after "to" is the action: "A knife is used to chop". Among pairs of a verb and
-        a noun that do not overlap, the pair that covers most characters wins; between equal pairs, the first verb.
+        Hand phrases and negated clauses are skipped. A verb after "to" is the action: "A knife is used to chop". Among
+        pairs of a verb and a noun that do not overlap, the pair that covers most characters wins; between equal pairs,
+        the first verb.
         """
-        rest = " ".join(HAND_PHRASE.sub(" ¤ ", text.lower()).split())
+        rest = " ".join(_affirmed(HAND_PHRASE.sub(" ¤ ", text.lower())).split())
         verbs, nouns = self._verbs.matches(rest), self._nouns.matches(rest)
         verbs = [verb for verb in verbs if _PURPOSE.search(rest, 0, verb.start)] or verbs
         pairs = [(verb, noun) for verb in verbs for noun in nouns if not verb.overlaps(noun)]
@@ -74,6 +81,12 @@ class Lexicon:
             return verb.base, noun.base
         verb = max(verbs, key=lambda match: match.length, default=None)
         return (verb.base if verb else None), None
+
+
+def _affirmed(text: str) -> str:
+    """A lower-case text without its negated clauses; unchanged if no verb is left."""
+    affirmed = _NEGATED.sub(" ", text)
+    return affirmed if first_verb(re.sub(r"\buse\s+¤", "", affirmed)) else text
 
 
 class _Forms:
@@ -194,7 +207,7 @@ def read_sentence(text: str) -> tuple[str | None, str | None]:
 
 def further_verbs(text: str, generated: str | None, vocabulary: Vocabulary) -> list[str]:
     """Training verbs in a sentence in addition to the generated one, such as "pour" in "Lift a mug and pour"."""
-    clauses = [re.findall(r"[a-z-]+", clause) for clause in _BETWEEN_CLAUSES.split(text.lower())]
+    clauses = [re.findall(r"[a-z-]+", clause) for clause in _BETWEEN_CLAUSES.split(_affirmed(text.lower()))]
     clauses = [rest for words in clauses if (rest := words[_count_adverbs(words) :])]
     verbs = sorted(filter(None, vocabulary.verbs))
     first = clauses[0][0] if clauses else ""

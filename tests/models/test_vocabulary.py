@@ -56,6 +56,10 @@ ACTIONS = Vocabulary(
         ("Lift a mug and pour-over kettle.", "lift", []),
         ("A drink is lifted with the left hand.", "lift", []),
         ("now slowly,", "lift", []),
+        ("Lift the mug, never pour.", "lift", []),
+        ("Without lifting the mug, pour.", "pour", []),
+        ("The mug is not lifted, but placed.", "place", []),
+        ("Instead of drinking from the mug, lift it and pour.", "lift", ["pour"]),
     ],
 )
 def test_a_second_training_action_of_a_sentence_is_found(text, made, further):

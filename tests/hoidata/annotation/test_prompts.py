@@ -126,3 +126,31 @@ def test_a_form_that_stands_for_two_words_is_refused() -> None:
 def test_a_prompt_gives_back_its_verb_and_object(text: str, verb: str | None, noun: str | None) -> None:
     reading = read_prompt(text)
     assert (reading.verb, reading.object_words) == (verb, noun)
+
+
+@pytest.mark.parametrize(
+    ("text", "verb", "noun"),
+    [
+        ("Open the box with the right hand but do not close it.", "open", "box"),
+        ("Lift the mug, do not drink from it.", "lift", "mug"),
+        ("Lift the mug and don't drink from it.", "lift", "mug"),
+        ("Lift the mug, don’t drink from it.", "lift", "mug"),
+        ("Open the box, never close it.", "open", "box"),
+        ("Open the box without closing the bottle.", "open", "box"),
+        ("Open the box instead of closing it.", "open", "box"),
+        ("Open the box rather than closing it with the left hand.", "open", "box"),
+        ("Do not close the bottle; open the box.", "open", "box"),
+        ("The right hand opens the box but does not close it.", "open", "box"),
+        ("Not only lift the mug but also drink from it.", "drink", "mug"),
+        # Nothing else is left.
+        ("Do not close the box.", "close", "box"),
+        ("Don't lift the mug with the left hand, use the right hand.", "lift", "mug"),
+        # A negated hand is not a negated action.
+        ("Without using the left hand lift the mug.", "lift", "mug"),
+        ("Use the right hand instead of the left hand to lift the mug.", "lift", "mug"),
+        ("Use your right rather than your left to lift the mug.", "lift", "mug"),
+    ],
+)
+def test_a_negated_clause_gives_no_verb(text: str, verb: str, noun: str) -> None:
+    reading = read_prompt(text)
+    assert (reading.verb, reading.object_words) == (verb, noun)
