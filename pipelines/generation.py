@@ -121,7 +121,7 @@ def generate_files(request: GenerationRequest, out: Path, store: Path | None = N
         notes.append(note)
     if evidence["verb"] is None:
         notes += [f"never seen: {note}" for note in evidence["unseen"]]
-    notes += _further_verb_notes(wording.text, verb, generator.vocabulary)
+    notes += _further_verb_notes(request, wording)
     verdicts = [line for motion in motions for line in verdict_lines(motion.evidence["number"], motion.verdict)]
     paths = write_generation(out, motions, hands, str(models.checkpoints), notes)
     clips = [replace(motion.clip, verb=evidence["verb"]) for motion in motions]
@@ -206,19 +206,25 @@ def _wording(request: GenerationRequest) -> Wording:
     def encoder() -> TextEncoder:
         return models.encoder if models else _profile_settings(request.profile)[0]
 
-    folders = [models.checkpoints] if models else [paths.checkpoints for paths in trained_runs(request)]
     # A sentence may contain the words of the object's name although they are not English.
     name = request.object.stem if isinstance(request.object, Path) else request.object
-    return understood_words(request.text, reduce(add, map(_vocabulary, folders)), encoder, (name,), request.force)
+    return understood_words(request.text, _trained_vocabulary(request), encoder, (name,), request.force)
 
 
-def _further_verb_notes(text: str, verb: str | None, vocabulary: Vocabulary) -> list[str]:
+def _trained_vocabulary(request: GenerationRequest) -> Vocabulary:
+    """The words of all models that a request may use."""
+    models = request.models
+    folders = [models.checkpoints] if models else [paths.checkpoints for paths in trained_runs(request)]
+    return reduce(add, map(_vocabulary, folders))
+
+
+def _further_verb_notes(request: GenerationRequest, wording: Wording) -> list[str]:
     """A note that names the verbs of the sentence which the motion does not show: a motion has one verb."""
-    further = further_verbs(text, verb, vocabulary)
-    if verb is None or not further:
+    further = further_verbs(wording.text, wording.verb, _trained_vocabulary(request))
+    if wording.verb is None or not further:
         return []
     others = ", ".join(map(repr, further))
-    return [f"a motion shows one action: this one shows {verb!r}, not {others}; generate each alone"]
+    return [f"a motion shows one action: this one shows {wording.verb!r}, not {others}; generate each alone"]
 
 
 def _project_models(request: GenerationRequest, verb: str | None, noun: str | None) -> tuple[Models, str]:

@@ -10,6 +10,7 @@ import yaml
 from typer.testing import CliRunner
 
 from hoidata.annotation.vocabulary import Vocabulary
+from hoidata.annotation.wording import Wording
 from hoidata.errors import BadInput, MissingResource
 from hoidata.objects.user_mesh import read_user_object
 from models.common.checkpoints import FILE_NAME
@@ -22,6 +23,7 @@ from pipelines.generation import (
     GenerationRequest,
     Models,
     _dataset_with_object,
+    _further_verb_notes,
     _missing_hinge_notes,
     _networks,
     _project_models,
@@ -145,6 +147,13 @@ def test_the_verb_chooses_the_models_then_the_named_object_then_the_noun(
     )
     expected = StagePaths("embedded", holder or ("arctic" if name == "kettle" else dataset))
     assert _dataset_with_object(request, paths) == expected
+
+
+def test_a_second_action_that_only_other_models_know_is_named(three_datasets) -> None:
+    request = GenerationRequest("Open the box, take out the bottle and pour.", "box", "embedded", three_datasets)
+    (note,) = _further_verb_notes(request, Wording(request.text, "open", "box"))
+    assert note == "a motion shows one action: this one shows 'open', not 'take out', 'pour'; generate each alone"
+    assert not _further_verb_notes(replace(request, model="grab"), Wording("Pour and open.", "pour", None))
 
 
 @pytest.fixture
