@@ -28,6 +28,10 @@ _NEGATED = re.compile(
     r"instead\s+of|rather\s+than)\b(?!(?:\s+(?:use|using|with|in|by|the|your|my|his|her|their))*\s+"
     r"(?:¤|(?:left|right|both|one|two|hands?)\b)).*?(?=[,;:.!?&]|\b(?:and|then|but)\b|$)"
 )
+# The words before a noun, such as a place: "from the table".
+_ARTICLE = r"\s+(?:(?:a|an|the|this|that|your|my|his|her|their|its|our)\s+)?$"
+_FROM = re.compile(rf"\bfrom{_ARTICLE}")
+_PLACE = re.compile(rf"\b(?:from|off|on|onto|into|in|inside|next\s+to|near|beside|beneath|under){_ARTICLE}")
 # The words before the verb in "A knife is used by the right hand to chop".
 _PURPOSE = re.compile(r"\b(?:hold|holds|held|holding|use|uses|used|using)\b.*\bto $")
 
@@ -69,18 +73,35 @@ class Lexicon:
         """Find the verb and the object of a sentence, base forms.
 
         Hand phrases and negated clauses are skipped. A verb after "to" is the action: "A knife is used to chop". Among
-        pairs of a verb and a noun that do not overlap, the pair that covers most characters wins; between equal pairs,
-        the first verb.
+        pairs of a verb and a noun that do not overlap, the verb of the pair that covers most characters wins; between
+        equal pairs, the first verb.
         """
         rest = " ".join(_affirmed(HAND_PHRASE.sub(" ¤ ", text.lower())).split())
         verbs, nouns = self._verbs.matches(rest), self._nouns.matches(rest)
         verbs = [verb for verb in verbs if _PURPOSE.search(rest, 0, verb.start)] or verbs
         pairs = [(verb, noun) for verb in verbs for noun in nouns if not verb.overlaps(noun)]
         if pairs:
-            verb, noun = max(pairs, key=lambda pair: (pair[0].length + pair[1].length, -pair[0].start))
-            return verb.base, noun.base
+            verb, _ = max(pairs, key=lambda pair: (pair[0].length + pair[1].length, -pair[0].start))
+            return verb.base, _object_of(verb, nouns, rest).base
         verb = max(verbs, key=lambda match: match.length, default=None)
         return (verb.base if verb else None), None
+
+
+def _object_of(verb: _Match, nouns: list[_Match], text: str) -> _Match:
+    """The noun that a verb acts on: the first after it, else in the text; a place only if there is nothing else."""
+    free = [noun for noun in nouns if not noun.overlaps(verb)]
+    whole = [noun for noun in free if noun.length == max(other.length for other in free if noun.overlaps(other))]
+    # The "on" of the verb "put on" names no place.
+    searched_from = {noun: verb.stop if noun.start > verb.start else 0 for noun in whole}
+    no_places = [noun for noun in whole if not _PLACE.search(text, searched_from[noun], noun.start)]
+    sources = [noun for noun in whole if _is_source(verb, noun, text)]
+    return min(sources or no_places or whole, key=lambda noun: (noun.start < verb.start, noun.start))
+
+
+def _is_source(verb: _Match, noun: _Match, text: str) -> bool:
+    """Whether a verb acts on the noun after its "from": "Pour water from a teapot"."""
+    phrase = default_phrases().verbs.get((verb.base, noun.base))
+    return bool(phrase) and phrase.said.base.endswith(" from") and bool(_FROM.search(text, 0, noun.start))
 
 
 def _affirmed(text: str) -> str:

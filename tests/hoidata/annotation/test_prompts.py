@@ -157,3 +157,36 @@ def test_a_prompt_gives_back_its_verb_and_object(text: str, verb: str | None, no
 def test_a_negated_clause_gives_no_verb(text: str, verb: str, noun: str) -> None:
     reading = read_prompt(text)
     assert (reading.verb, reading.object_words) == (verb, noun)
+
+
+@pytest.mark.parametrize(
+    ("text", "noun"),
+    [
+        ("Lift the cup from the table with the right hand.", "cup"),
+        ("Open the box on the table", "box"),
+        ("Place the cup next to the laptop", "cup"),
+        ("Place the cup beside your laptop", "cup"),
+        ("On the table the box is lifted", "box"),
+        ("The cup on the table is lifted by the left hand", "cup"),
+        ("Lift the mug and place it on the table", "mug"),
+        ("From the laptop, lift the cup.", "cup"),
+        ("Open the box with a screwdriver", "box"),
+        ("Put on the headphones from the table", "headphones"),
+        ("Lift the water bottle off the microwave", "water bottle"),
+        # A place if there is nothing else; of two, the first.
+        ("Drink from a mug", "mug"),
+        ("Pour from the water bottle", "water bottle"),
+        ("Drink from the mug on the table", "mug"),
+        ("Pour from the mug into the water bottle", "mug"),
+        ("Pour milk into the cup", "milk"),
+        ("Pour water from the teapot into the cup", "teapot"),
+    ],
+)
+def test_the_object_is_the_first_noun_after_the_verb_that_is_no_place(text: str, noun: str) -> None:
+    assert read_prompt(text).object_words == noun
+
+
+def test_of_overlapping_nouns_the_longest_is_the_object() -> None:
+    lexicon = Lexicon([("lift", "lift")], [(noun, noun) for noun in ("coffee", "cup", "coffee cup", "dining table")])
+    assert lexicon.read("lift the coffee cup from the dining table") == ("lift", "coffee cup")
+    assert lexicon.read("lift the cup from the dining table") == ("lift", "cup")
