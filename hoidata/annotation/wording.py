@@ -77,11 +77,10 @@ def understood_words(
     verb = parsed_verb(text, verbs)
     if noun in (None, "hand"):
         noun = _phrase_after_article(text, verb)
-    synonyms = (synonym_of(verb), *PARAPHRASES.get(verb, ())) if verb else ()
-    trained_synonym = next((synonym for synonym in synonyms if synonym in verbs), None)
-    if verb not in verbs and trained_synonym:
-        notes.append(f"{verb!r} is read as {trained_synonym!r}")
-        text, verb = _replaced(text, str(verb), trained_synonym), trained_synonym
+    trained = trained_verb(text, verbs)
+    if verb and trained and verb != trained:
+        notes.append(f"{verb!r} is read as {trained!r}")
+        text, verb = _replaced(text, verb, trained), trained
     if verbs and verb not in verbs and not force:
         first = first_verb(text)
         raise _untrained(verb or (None if first in vocabulary.objects else first), text, verbs, encoder)
@@ -90,6 +89,13 @@ def understood_words(
         notes += [] if force else [f"{noun!r} is taken for {longer_names[0]!r}"]
         noun = longer_names[0]
     return Wording(text, verb, noun, tuple(notes))
+
+
+def trained_verb(text: str, verbs: Sequence[str]) -> str | None:
+    """The verb of a sentence, or its first synonym among ``verbs`` if it is none of them itself."""
+    verb = parsed_verb(text, verbs)
+    synonyms = (synonym_of(verb), *PARAPHRASES.get(verb, ())) if verb else ()
+    return verb if verb in verbs else next((synonym for synonym in synonyms if synonym in verbs), verb)
 
 
 def parsed_verb(text: str, verbs: Sequence[str]) -> str | None:

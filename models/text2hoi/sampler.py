@@ -16,7 +16,7 @@ from torch import Tensor
 from hoidata.annotation.encoders import TextEncoder
 from hoidata.annotation.hand_choice import HandChoice, Method, choose_hand
 from hoidata.annotation.vocabulary import Vocabulary
-from hoidata.annotation.wording import parsed_verb
+from hoidata.annotation.wording import trained_verb
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import Request, RequestBatch, bucket_by_length, collate_requests
 from hoidata.clips.clip import Clip
@@ -123,9 +123,9 @@ class Text2Hoi(ReportsContact):
         return self.trained["diffusion"].facts
 
     def verb_of(self, request: Request) -> str | None:
-        """The verb of a request's sentence, base form; None if the grammar finds none."""
+        """The verb of a request's sentence, as it was trained, base form; None if the grammar finds none."""
         verbs = Vocabulary.read(self.facts).verb_names
-        return parsed_verb(request.sentence.words, verbs) if request.sentence else None
+        return trained_verb(request.sentence.words, verbs) if request.sentence else None
 
     def choose_hand(self, text: str, encoder: TextEncoder, method: Method | None = None) -> HandChoice:
         """The hand of a sentence; without a ``method`` by similarity for preset `paper`, by rules for others."""

@@ -2,6 +2,8 @@
 
 import csv
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -9,8 +11,9 @@ from hoidata.annotation.encoders import load_encoder
 from hoidata.annotation.hand_choice import HAND_TYPES
 from hoidata.annotation.sentences import FORMS, english_sentences, reference_sentences
 from hoidata.annotation.vocabulary import Vocabulary
-from hoidata.annotation.wording import Wording, edit_distance, understood_words
+from hoidata.annotation.wording import Wording, edit_distance, trained_verb, understood_words
 from hoidata.errors import BadInput
+from models.text2hoi.sampler import Text2Hoi
 
 VERBS = ("lift", "drink", "pour", "place", "take out", "inspect", "hand over", "pass")
 OBJECTS = ("mug", "water bottle", "wine glass", "large cube", "box", "book")
@@ -105,6 +108,28 @@ def test_a_synonym_becomes_the_training_verb_in_the_same_form(synonym: str, verb
 )
 def test_separated_verbs_and_unknown_objects_are_found(text: str, verb: str, noun: str | None) -> None:
     assert understood(text) == Wording(text, verb, noun, understood(text).notes)
+
+
+@pytest.mark.parametrize(
+    ("text", "verb"),
+    [
+        ("Pick the mug up", "lift"),
+        ("Pick up the mug", "lift"),
+        ("Put the mug down", "place"),
+        ("Set the mug down with the left hand", "place"),
+        ("Raise the mug", "lift"),
+        ("Take the mug out", "take out"),
+        ("Juggle the mug", None),
+        ("Throw the mug", "throw"),
+    ],
+)
+def test_the_networks_get_a_trained_verb_for_separated_words(text: str, verb: str | None) -> None:
+    assert trained_verb(text, VERBS) == verb
+    model, request = (
+        SimpleNamespace(facts={"vocabulary": KNOWN.rows}),
+        SimpleNamespace(sentence=SimpleNamespace(words=text)),
+    )
+    assert Text2Hoi.verb_of(cast(Any, model), cast(Any, request)) == verb
 
 
 def test_the_last_word_of_one_training_object_names_it() -> None:
