@@ -171,6 +171,15 @@ _DENIED = (
     rf"(?P<bare>left|right){_CLAUSE_END})"
 )
 NEGATED = (re.compile(rf"{_NOT}{_LOOSE}{_DENIED}"), re.compile(rf"{_NOT_NEAR}{_TIGHT}{_DENIED}"))
+# A hand that is kept away or rests is not the active hand.
+_ASIDE = r"(?:away|still|free|idle|on|off)\b"
+AT_REST = (
+    re.compile(rf"\b(?:keep|keeps|keeping|leave|leaves|leaving)\s+{_DET}?{_MENTION}\s+{_ASIDE}"),
+    re.compile(
+        rf"\b{_MENTION}\s+(?:(?:(?:is|are|stays?|remains?)\s+)?(?:rest(?:s|ing)?\b|free\b|idle\b)|"
+        rf"(?:does|do|doing)\s+nothing\b|(?:(?:is|are)\s+)?(?:kept|left)\s+{_ASIDE}|(?:stays?|remains?)\s+{_ASIDE})"
+    ),
+)
 # A hand that receives an object, or is a location, is not the active hand.
 PLACED = re.compile(
     rf"\b(?:on|onto|near|beside|behind|under|above|towards?|(?:left|right|top|front|side|next|close)\s+(?:of|to))\s+"
@@ -228,6 +237,8 @@ def find_mentions(text: str) -> Mentions:
         rest = EITHER.sub(BLANK, rest)
     for pattern in NEGATED:
         rest = _take(pattern, rest, lambda match: mentions.denied.add(_denied(match)), mentions)
+    for pattern in AT_REST:
+        rest = _take(pattern, rest, lambda match: mentions.denied.add(_side(match)), mentions)
     for pattern in (HANDED, OTHER_HAND, *HANDS):
         rest = _take(pattern, rest, lambda match: setattr(mentions, "both", True), mentions)
     rest = RECEIVING.sub(BLANK, PLACED.sub(BLANK, rest))

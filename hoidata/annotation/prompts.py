@@ -20,7 +20,8 @@ HAND_PHRASE = re.compile(
     r"\b(?:(?:with|by|in|using)\s+)?(?:(?:only|just)\s+)?(?:(?:the|your|my|his|her|their)\s+)?(?:left|right)\s+hand\b|"
     r"\b(?:(?:with|by|in|using)\s+)?(?:(?:only|just)\s+)?(?:both|two)\s+(?:of\s+)?(?:(?:the|your|my|his|her|their)\s+)?hands\b|"
     r"\b(?:with|by)\s+(?:(?:only|just)\s+)?(?:(?:the|your|my|his|her|their|a|one)\s+)?(?:single\s+)?hand\b|"
-    r"\busing\s+(?:(?:only|just)\s+)?(?:the|your|my|his|her|their|a|one)\s+(?:single\s+)?hand\b"
+    r"\busing\s+(?:(?:only|just)\s+)?(?:the|your|my|his|her|their|a|one)\s+(?:single\s+)?hand\b|"
+    r"\b(?:(?:left|right|one|two|single)(?:-|\s+)handedly|bimanually)\b"
 )
 # A clause that negates an action, and not a hand: "but do not close it", "without closing it".
 _NEGATED = re.compile(
@@ -166,7 +167,7 @@ NAMED = 3
 _FUNCTION_WORDS = """the a an with of to from in on onto into at and or then while it its your my his her their this
 that these those as if for until without using only one two three four five both each every no not towards toward
 beside against but because than nor per upon beneath during ok
-six seven eight nine ten twenty thirty forty fifty sixty ninety"""
+handedly bimanually six seven eight nine ten twenty thirty forty fifty sixty ninety"""
 _BETWEEN_CLAUSES = re.compile(r"[,;.&]|\band/or\b|\b(?:and|then)\b")
 _ADVERBS = frozenset({"also", "again", "now", "next", "please", "first"})
 # A noun follows these words: "drink" in "a drink" is not a verb.
@@ -212,7 +213,7 @@ def read_sentence(text: str) -> tuple[str | None, str | None]:
 
     Raises BadInput for an empty text, more than 60 words, and text that is not English.
     """
-    words = ["".join(filter(str.isalpha, word)) for word in text.split()]
+    words = ["".join(filter(str.isalpha, word)) for word in re.split(r"[\s-]+", text)]
     words = [word.lower() for word in words if word]
     remedy = "write an English sentence, like: Lift a mug with the right hand."
     if not words:

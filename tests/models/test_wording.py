@@ -140,6 +140,13 @@ def test_the_last_word_of_one_training_object_names_it() -> None:
     assert (ambiguous.noun, ambiguous.notes) == ("bottle", ())
 
 
+@pytest.mark.parametrize("adverb", ["two-handedly", "bimanually", "single-handedly", "left-handedly", "right handedly"])
+@pytest.mark.parametrize("noun", ["box", "vase", "gizmo"])
+def test_adverbs_of_hands_are_english_and_no_part_of_the_object(adverb: str, noun: str) -> None:
+    text = f"Lift the {noun} {adverb}."
+    assert understood(text, False, "gizmo") == Wording(text, "lift", noun)
+
+
 def test_of_several_paraphrases_the_first_that_was_trained_is_used() -> None:
     for verbs, expected in ((("grab", "grasp"), "grasp"), (("grab", "lift"), "grab")):
         vocabulary = Vocabulary({(verb, "mug", "left"): 1 for verb in verbs})

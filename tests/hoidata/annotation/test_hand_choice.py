@@ -26,6 +26,8 @@ The box on the right is lifted by the left hand
 My left hand is holding the bowl | open it with your left-hand thumb | can you grab the spray, left hand please
 The right-hand side of the box is touched by the left hand | The left hand grips a book
 Lift a hand with the left hand.
+Hold the bottle with the left hand while the right hand rests on the table | Lift the box left-handedly
+Lift the mug with your free left hand | The left hand is on the mug and lifts it | Leave the mug with the left hand
 """
 RIGHT = """
 use your right | RH lifts the mug | R hand on the mug handle, lift | Not the left hand but the right
@@ -41,6 +43,11 @@ lift it with the rigth hand | lift it with the rright hand | lift it with the ri
 lift it with the rigght hand | lift it with the right hhand | lift it with the right handd
 lift with right hand not left hand | lift the left box with the right arm | lift a model hand with the right hand
 open the notebook using the fingers of your right hand | Fly a plane with the right hand, right over the table
+Drink with your right hand while your left hand is resting on the table
+Lift the mug with the right hand; the left hand does nothing
+Lift the mug with the right hand and keep your left hand on the table
+Lift the mug with the right hand, leaving the left hand free | Lift it right-handed, the left hand stays still
+Lift the mug with the right hand while the left hand is kept away | Lift the box right-handedly
 """
 BOTH = """
 lift it with obth hands | lift it with both hadns | lift it with bboth hands
@@ -52,6 +59,7 @@ Lift the box with left and right hand | bimanually rotate the cube | Both hands,
 The right grabs the mug while the left opens the lid | Grab the left mug handle with both hands | hands lift the crate
 Someone is opening a laptop with both of their hands | pass the apple from one hand to the other
 cradle it in her arms
+Keep both hands on the box and lift it | Lift the box two-handedly | Lift the box bimanually
 Steady the box with your left hand while lifting the lid with your right
 play the flute with all fingers of both hands
 Use both, left and right, to rotate the cube
@@ -74,6 +82,7 @@ The mug's handle points left; lift it | Just one hand, your choice: lift the mug
 She hands him the cup | two left shoes
 Lift it with the hand that is not the left | Squeeze the lotion single-handed
 move the book from the left to the right
+Lift the mug, but keep the right hand away | Lift the box single-handedly
 """
 
 
@@ -135,6 +144,8 @@ def test_a_lead_below_the_margin_is_a_guess_and_not_taken(lead: float, hand: str
     [
         ("pick up the cup", {"left": 0.25, "right": 0.5, "both": 0.25}, "right", 0.5),
         ("lift it without using your right hand", {"left": 0.25, "right": 0.5, "both": 0.25}, "left", 1),
+        ("lift it, but keep the right hand away", {"left": 0.25, "right": 0.5, "both": 0.25}, "left", 1),
+        ("lift it single-handedly", {"right": 0.4, "both": 0.6}, "right", 1),
         ("one hand only", {"left": 1 / 3, "right": 0.0, "both": 2 / 3}, "left", 1),
         ("lift it with one hand", {"right": 0.6, "both": 0.4}, "right", 1),
         ("lift it", {"right": 0.6, "both": 0.2}, "right", 0.75),
