@@ -18,7 +18,8 @@ from hoidata.errors import BadInput
 
 HAND_PHRASE = re.compile(
     r"\b(?:(?:with|by|in|using)\s+)?(?:(?:only|just)\s+)?(?:(?:the|your|my|his|her|their)\s+)?(?:left|right)\s+hand\b|"
-    r"\b(?:(?:with|by|in|using)\s+)?(?:(?:only|just)\s+)?(?:both|two)\s+(?:of\s+)?(?:(?:the|your|my|his|her|their)\s+)?hands\b|"
+    r"\b(?:(?:with|by|in|using)\s+)?(?:(?:only|just)\s+)?(?:both|two)\s+"
+    r"(?:of\s+)?(?:(?:the|your|my|his|her|their)\s+)?hands\b|"
     r"\b(?:with|by)\s+(?:(?:only|just)\s+)?(?:(?:the|your|my|his|her|their|a|one)\s+)?(?:single\s+)?hand\b|"
     r"\busing\s+(?:(?:only|just)\s+)?(?:the|your|my|his|her|their|a|one)\s+(?:single\s+)?hand\b|"
     r"\b(?:(?:left|right|one|two|single)(?:-|\s+)handedly|bimanually)\b"

@@ -92,7 +92,7 @@ def understood_words(
 
 
 def trained_verb(text: str, verbs: Sequence[str]) -> str | None:
-    """The verb of a sentence, or its first synonym among ``verbs`` if it is none of them itself."""
+    """The verb of a sentence, or its first synonym in ``verbs`` if the verb is not there."""
     verb = parsed_verb(text, verbs)
     synonyms = (synonym_of(verb), *PARAPHRASES.get(verb, ())) if verb else ()
     return verb if verb in verbs else next((synonym for synonym in synonyms if synonym in verbs), verb)
