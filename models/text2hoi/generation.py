@@ -173,9 +173,7 @@ class Generator:
             motions.append(GeneratedMotion(clip, coarse, answer.touched.numpy(), cloud, evidence, checks))
         return motions
 
-    def _verdict(
-        self, clip: Clip, verb: str | None, cloud: SampledPoints, up: Sequence[float] | None
-    ) -> tuple[Check, ...]:
+    def _verdict(self, clip: Clip, verb: str | None, cloud: SampledPoints, up: Any) -> tuple[Check, ...]:
         points = ObjectPoints(cloud.points_m, cloud.normals, cloud.part)
         ranges = verb_ranges(self.model.trained["diffusion"], self.hands)
         requested = requested_verb(verb, self.vocabulary.verbs, ranges, clip, points)

@@ -268,7 +268,7 @@ def test_a_request_needs_only_the_networks_that_it_uses(tmp_path: Path, monkeypa
         "contact refinement": (replace(request, sampling={"refine": "contact"}), ["contact", "diffusion", "length"]),
         "neither": (replace(given_length, sampling={"refine": "none"}), ["contact", "diffusion"]),
     }
-    assert {name: _networks(asked) for name, (asked, _) in needed.items()} == {
+    assert {name: _networks(request) for name, (request, _) in needed.items()} == {
         name: networks for name, (_, networks) in needed.items()
     }
     paths = StagePaths("embedded", "grab")
