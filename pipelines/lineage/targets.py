@@ -157,10 +157,13 @@ def _output(root: Path, name: str) -> Target:
 
 def lock_record(root: Path, locks: dict[str, Locked], stage: str) -> dict[str, Any]:
     """The entries of a stage and all upstream stages in dvc.lock, in the form of a checkpoint's provenance."""
-    makers, order = {out: lock.name for lock in locks.values() for out in lock.outs if (root / out).exists()}, [stage]
+    order, inputs = [stage], {path for lock in locks.values() for path in lock.deps}
+    # Methods that params.yaml does not list any more may be in a lock file without outputs.
+    outs = ((out, lock.name) for lock in locks.values() for out in lock.outs)
+    makers = {out: name for out, name in outs if out in inputs or (root / out).exists()}
     for name in order:
-        inputs = (producer for path in locks[name].deps for producer in producers_of(makers, path))
-        order += [producer for producer in dict.fromkeys(inputs) if producer not in (*order, "code")]
+        upstream = (producer for path in locks[name].deps for producer in producers_of(makers, path))
+        order += [producer for producer in dict.fromkeys(upstream) if producer not in (*order, "code")]
     stages = {name: _lock_stage(root, locks[name]) for name in dict.fromkeys(order)}
     return {"schema": SCHEMA_LOCK, "stage": stage, "stages": stages}
 

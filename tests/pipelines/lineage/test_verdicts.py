@@ -225,6 +225,9 @@ def test_the_lineage_of_metrics_has_the_networks_of_their_motions(ran):
     assert changed_nodes(ran.root, name)["data checkpoints/embedded/grab/contact"] == "tampered"
     checked = check(ran.root, find_target(ran.root, name, ran.root))
     assert {node.status for node in checked if "contact" in node.name} == {"tampered"}
+    shutil.rmtree(ran.root / "checkpoints/embedded/grab/contact")
+    checked = check(ran.root, find_target(ran.root, name, ran.root))
+    assert {node.status for node in checked if "contact" in node.name} == {"missing"}
 
 
 def test_an_overlay_of_the_profile_is_no_change_of_what_dvc_recorded(ran):
