@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hoidata.actions.action import training_actions
 from hoidata.batches.dataset import HoiDataset, contact_of
 from hoidata.clips.clip import SIDES
 from hoidata.errors import BadInput
@@ -100,6 +101,19 @@ def test_recorded_windows_are_measured_as_perfect_each_by_itself(
     figures = result["figures"]
     assert (figures["joint_error_mm"], figures["contact_f1"], figures["bimart_mul_cm"]) == (0, 1, 0)
     assert set(read_target_contact(tmp_path / "out" / "clips")) == set(open_store(tmp_path / "out" / "clips").ids)
+
+
+def test_verbs_of_windows_are_compared_with_training_windows(
+    annotated: AnnotatedStore, annotated_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sample_family(load_family("ground-truth"), annotated_root, tmp_path, tmp_path / "out", SECTION, HANDS)
+    learnt = []
+    monkeypatch.setattr(
+        "hoidata.metrics.evaluate.training_actions", lambda store: learnt.append(store) or training_actions(store)
+    )
+    evaluate_store(tmp_path / "out" / "clips", annotated_root, HANDS)
+    assert learnt[0].ids("train") == WindowedStore(annotated, PROTOCOL, "train").ids("train")
+    assert all("@" in clip_id for clip_id in learnt[0].ids("train"))
 
 
 def test_without_a_window_nothing_is_sampled(annotated_root: Path, tmp_path: Path) -> None:

@@ -8,15 +8,21 @@ from typing import get_args
 import numpy as np
 import pytest
 
+from hoidata.clips import SIDES
+from hoidata.contact.proximity import ProximityIndex
 from hoidata.errors import BadInput
 from hoidata.files.arrays import write_npz
+from hoidata.hands import load_embedded_hands
 from hoidata.metrics import registry
 from hoidata.metrics.describe import readme
-from hoidata.metrics.evaluate import ClipResult, Sample, evaluate_store, intervals_of, match_predictions
+from hoidata.metrics.evaluate import ClipResult, Sample, _Reference, evaluate_store, intervals_of, match_predictions
 from hoidata.metrics.optional_metrics import select_metrics
+from hoidata.metrics.pair import Motion
 from hoidata.metrics.registry import METRICS, is_better, metric, summarise
 from hoidata.metrics.target_contact import FILE_NAME, write_target_contact
+from hoidata.objects.sampling import sample_points
 from hoidata.store.annotated import load_annotated
+from hoidata.store.distances import DistanceEntries
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from tests.builders.annotated import write_annotated_dataset
@@ -151,19 +157,25 @@ def test_a_motion_numbered_from_zero_starts_at_the_first_frame_of_any_recording(
     assert evaluation["figures"]["joint_error_mm"] == 0
 
 
-def test_frames_that_were_not_recorded_count_neither_for_nor_against_a_motion(make_clip, tmp_path):
-    """Every third frame of the recording is interpolated; a hand that touches there touched nothing."""
-
-    def gapped(*args, **kwargs):
-        clip = make_clip(*args, **kwargs)
-        frames = clip.source_frames.copy()
-        frames[2::3] = frames[1::3][: len(frames[2::3])]
-        return replace(clip, source_frames=frames)
-
-    root, clips = write_annotated_dataset(tmp_path / "gapped", gapped)
-    evaluation = evaluate_store(written(tmp_path / "same", clips.values()), root)
-    assert evaluation["figures"]["contact_f1"] == 1
-    assert evaluation["figures"]["contact_recall"] == 1
+def test_a_touch_in_a_frame_that_was_not_recorded_is_no_contact_of_the_reference(make_clip):
+    """Frame 2 is interpolated, the right hand is not tracked in frame 3, and the left hand does not act."""
+    clip = make_clip(6, "both")
+    right = replace(clip.hands["right"], valid=np.arange(6) != 3)
+    frames = np.array([0, 1, 1, 3, 4, 5], np.int32)
+    clip = replace(clip, source_frames=frames, hands={**clip.hands, "right": right})
+    columns = np.array([[1, 1, 1, 1, 0], [1, 2, 3, 5, 1], [0, 0, 0, 0, 0], [3, 5, 7, 9, 11]])
+    points = sample_points(clip.object.model, 256)
+    reference = _Reference(
+        motion=Motion(clip, {side: np.zeros((6, 21, 3)) for side in SIDES}, load_embedded_hands()),
+        sides=("right",),
+        entries=DistanceEntries(*columns, np.full(5, 0.01)),
+        index=ProximityIndex(points),
+        part=points.part,
+        threshold_m=0.02,
+        table_m=None,
+        verb=None,
+    )
+    assert np.flatnonzero(reference.cut(0, 6)[1].touched).tolist() == [3, 9]
 
 
 def test_evaluation_uses_threshold_and_points_of_the_contact_stage(write_annotated, tmp_path):

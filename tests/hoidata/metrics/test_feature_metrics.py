@@ -2,13 +2,24 @@
 
 import statistics
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hoidata.metrics.encoded import UNKNOWN, EncodedSet
 from hoidata.metrics.feature_metrics import FEATURE_METRICS, feature_results
-from hoidata.metrics.feature_sets import TOO_SMALL, FeatureMetricResult, fid_frechet, fid_paired, frechet_distance, kid
+from hoidata.metrics.feature_sets import (
+    TOO_SMALL,
+    FeatureMetricResult,
+    fid_frechet,
+    fid_paired,
+    frechet_distance,
+    kid,
+    mean_matrix,
+    mean_of_pairs,
+    mean_with_itself,
+)
 from hoidata.metrics.unmeasured import Unmeasured
 
 CLIPS, LABELS = 60, ("close", "lift", "open")
@@ -268,3 +279,13 @@ def test_unmeasured_feature_metrics_have_a_reason():
     assert results["multimodality_by_prompt_corrected"] == Unmeasured("the clip has one motion")
     alone = encoded(normal(2, 3), label=np.array([0, 1]))
     assert feature_results(alone, alone)["multimodality_by_label_corrected"] == Unmeasured("no label has two clips")
+
+
+def test_clips_that_share_no_repetition_have_no_distance():
+    """Clips 0 and 1 are in one repetition only, clips 2 and 3 in the other; within each, all pairs are 10 apart."""
+    runs = [SimpleNamespace(clip=np.array(pair)) for pair in ([0, 1], [2, 3])]
+    matrix = mean_matrix(SimpleNamespace(clips=np.arange(4), repetitions=runs), lambda run: 10 - 10 * np.eye(2))
+    assert np.isnan(matrix[:2, 2:]).all()
+    weights = np.array([[1.0, 1, 1, 1], [2, 0, 1, 1], [1, 0, 1, 0]])
+    np.testing.assert_array_equal(mean_of_pairs(matrix, weights), [10, 10, np.nan])
+    np.testing.assert_array_equal(mean_with_itself(matrix, weights), [5, 2.5, 0])
